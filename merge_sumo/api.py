@@ -52,11 +52,11 @@ from merge_sumo.campaigns.plan import (
     resolve,
     settings_for,
 )
-from merge_sumo.campaigns.run import SETTINGS, Run, read_settings
+from merge_sumo.campaigns.recorded import SETTINGS, RecordedCampaign, read_settings
 from merge_sumo.campaigns.scenario_suggestion import unseen
 from merge_sumo.campaigns.settings import CampaignSettings, settings_of
 from merge_sumo.controllers.controller import Car, Seen
-from merge_sumo.controllers.in_memory import AnyVut, drivers_of, is_here
+from merge_sumo.controllers.in_memory import AnyVut, drivers_of, is_in_process
 from merge_sumo.controllers.parameters import Range
 from merge_sumo.controllers.python import SeenBatch
 from merge_sumo.drivers.policies import policies_in
@@ -278,7 +278,7 @@ def export(config: c.Export) -> list[Path]:
     """Write cases of a campaign for others, and return the paths."""
     indices = config.indices
     wanted = [indices] if isinstance(indices, int) else list(indices or ())
-    run = campaign_of(config.run).run
+    run = campaign_of(config.run).recorded
     return export_cases(run, wanted, config.file_format, path_of(config.out))
 
 
@@ -345,7 +345,7 @@ def compare(config: c.Compare) -> comparison.Comparison:
     if isinstance(config.runs, str | Path | CampaignRun):
         raise UserError("give several campaigns in a list, the oldest first")
     out, junit = _new_files(config)
-    versions = [campaign_of(run).run for run in config.runs]
+    versions = [campaign_of(run).recorded for run in config.runs]
     return _written(comparison.compare(versions), out, junit)
 
 
@@ -379,7 +379,7 @@ def benchmark(config: c.Benchmark) -> sampler_study.SamplerStudy:
 @verb(c.Probability)
 def probability(config: c.Probability) -> estimates.ProbabilityResult:
     """Estimate how likely the VUT of a campaign is to fail."""
-    before = campaign_of(config.run).run
+    before = campaign_of(config.run).recorded
     target = path_of(config.out) or before.folder / estimates.PROBABILITY.name
     total = estimates.DEFAULT_CASES if config.cases is None else config.cases
     with opened_study(before, config, "fresh cases", total, engine=config.engine) as study:
@@ -389,7 +389,7 @@ def probability(config: c.Probability) -> estimates.ProbabilityResult:
 @verb(c.Stress)
 def stress(config: c.Stress) -> ladder.StressResult:
     """Run the cases of a campaign again, each time a little otherwise."""
-    before = campaign_of(config.run).run
+    before = campaign_of(config.run).recorded
     ladder.STRESS.check(before.folder)
     cases = ladder.RUNS * sum(outcome.is_tested for outcome in before.outcomes)
     with opened_study(before, config, "cases again", cases) as study:
@@ -399,7 +399,7 @@ def stress(config: c.Stress) -> ladder.StressResult:
 @verb(c.Explain)
 def explain(config: c.Explain) -> explanation.ExplanationResult:
     """Find the smallest changes with which a failure passes."""
-    before = campaign_of(config.run).run
+    before = campaign_of(config.run).recorded
     explanation.EXPLANATIONS.check(before.folder)
     explanation.failure_of(before, config.case)
     ranges = tuple(map(Range.parsed, config.params))
@@ -478,7 +478,7 @@ def train(config: c.Train) -> PolicyChecks:
 
 @contextmanager
 def opened_study(
-    run: Run,
+    run: RecordedCampaign,
     config: c.Recorded,
     title: str,
     total: int | Mapping[Engine, int],
@@ -523,7 +523,7 @@ def opened_truths(
     plan = resolve(settings)
     for level in settings.levels:
         plan.at_level(level).with_engine(engine)
-    passing = is_here(settings.vut) or is_here(settings.pov or "")
+    passing = is_in_process(settings.vut) or is_in_process(settings.pov or "")
     with (
         open_workers(plan.workers(where.workers)) as workers,
         ScratchFolder() as folder,

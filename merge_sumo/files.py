@@ -111,7 +111,7 @@ def check_own(*paths: Path) -> None:
             raise UserError(f"cannot write {path}: it is {what}; remove it")
 
 
-def check_ours(path: Path, mark: bytes = GENERATOR) -> None:
+def check_generated(path: Path, mark: bytes = GENERATOR) -> None:
     """Raise `UserError` where there is a file that merge-sumo did not write.
 
     Args:
@@ -238,12 +238,12 @@ def replace_own(path: Path, content: bytes, mark: bytes = b"") -> None:
     Args:
         path: the file.
         content: its bytes.
-        mark: bytes that the older file contains (`check_ours`).
+        mark: bytes that the older file contains (`check_generated`).
 
     Raises:
         UserError: something else is there, or it cannot be written.
     """
-    check_ours(path, mark)
+    check_generated(path, mark)
     try:
         with _temporary(path) as (new, file):
             _sync(file, content)

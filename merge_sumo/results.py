@@ -11,8 +11,8 @@ from typing import Any
 from merge_sumo.analysis.cases_file import CasesFile
 from merge_sumo.analysis.comparison import Change, Comparison, compare_against
 from merge_sumo.analysis.share import SHARES
+from merge_sumo.campaigns.recorded import AGAINST, NAME_CHARACTERS, RecordedCampaign, failures
 from merge_sumo.campaigns.repeats import Repeat, read_repeats, unrepeatable
-from merge_sumo.campaigns.run import AGAINST, NAME_CHARACTERS, Run, failures
 from merge_sumo.config import AnyRun
 from merge_sumo.metrics.cause import cause
 from merge_sumo.metrics.measures import Measures
@@ -76,71 +76,73 @@ class CampaignRun(Result):
     """A campaign that was run: its folder, read, and its gates; `UserError` for another folder.
 
     Attributes:
-        run: the campaign as the rest of the package takes it.
+        recorded: the campaign as the rest of the package takes it.
         folder: the folder of the campaign.
     """
 
-    def __init__(self, folder: Path | str | Run, gates: Iterable[str] = ()) -> None:
-        self.run = folder if isinstance(folder, Run) else Run(Path(folder))
-        self.folder = self.run.folder
-        self._gates = parse_gates(gates, against=self.run.settings.against is not None)
+    def __init__(self, folder: Path | str | RecordedCampaign, gates: Iterable[str] = ()) -> None:
+        self.recorded = (
+            folder if isinstance(folder, RecordedCampaign) else RecordedCampaign(Path(folder))
+        )
+        self.folder = self.recorded.folder
+        self._gates = parse_gates(gates, against=self.recorded.settings.against is not None)
 
     @property
     def settings(self) -> dict[str, Any]:
         """Content of `campaign.json`."""
-        return self.run.record
+        return self.recorded.record
 
     @property
     def cases(self) -> Table:
         """All cases, in the order in which they were chosen."""
-        return Table(self.run.outcomes)
+        return Table(self.recorded.outcomes)
 
     @property
     def failures(self) -> Table:
         """The failing cases, the worst first."""
-        return Table(failures(self.run.cases))
+        return Table(failures(self.recorded.cases))
 
     @property
     def errors(self) -> Table:
         """The cases that ended in an error of the VUT or of the simulation, with the message."""
-        return Table(o for o in self.run.outcomes if o.measures.end.is_error)
+        return Table(o for o in self.recorded.outcomes if o.measures.end.is_error)
 
     @property
     def timeouts(self) -> Table:
         """The cases in which the VUT never merged."""
-        return Table(o for o in self.run.outcomes if o.measures.end is End.TIMEOUT)
+        return Table(o for o in self.recorded.outcomes if o.measures.end is End.TIMEOUT)
 
     @cached_property
     def repeats(self) -> list[Repeat]:
         """The cases that ran a second time, and whether they went as before."""
-        return read_repeats(self.run)
+        return read_repeats(self.recorded)
 
     @cached_property
     def verdict(self) -> Verdict:
         """How many cases failed, erred or timed out; errors and timeouts by message."""
-        return judge(self.run.outcomes, self.run.tolerated)
+        return judge(self.recorded.outcomes, self.recorded.tolerated)
 
     @cached_property
     def summary(self) -> Summary:
         """Cases, failures, regions and failure mode coverage by POV level."""
-        return summarise(self.run.outcomes, self.run.levels, self.run.tolerated)
+        return summarise(self.recorded.outcomes, self.recorded.levels, self.recorded.tolerated)
 
     @cached_property
     def facts(self) -> list[Fact]:
         """Each fact of the campaign, with the file and the key that it is from."""
-        return facts_of(self.run, self.summary, self.verdict)
+        return facts_of(self.recorded, self.summary, self.verdict)
 
     @cached_property
     def against(self) -> Comparison | None:
         """Changes from the version that the campaign is against; None without one."""
-        return compare_against(self.run)
+        return compare_against(self.recorded)
 
     @property
     def regressions(self) -> Table:
         """The cases that do not pass, and pass with that version, the worst first."""
         cases = [] if self.against is None else self.against.steps[0].cases
         broke = [case.b.index for case in cases if case.change is Change.BROKE]
-        return Table(self.run.outcome(index) for index in broke)
+        return Table(self.recorded.outcome(index) for index in broke)
 
     @cached_property
     def gates(self) -> list[GateResult]:
@@ -158,11 +160,11 @@ class CampaignRun(Result):
     @property
     def converged(self) -> bool:
         """Whether the search ended before its number of cases, as little new was found."""
-        return self.run.converged
+        return self.recorded.converged
 
     def trajectory(self, index: int) -> Trajectory:
         """Return the motion of a case; `UserError` for an index without a case."""
-        return self.run.trajectory(index)
+        return self.recorded.trajectory(index)
 
     @property
     def report_file(self) -> Path:
@@ -173,11 +175,11 @@ class CampaignRun(Result):
         """Write the HTML report and return its path."""
         from merge_sumo.reports.report import write_report
 
-        return write_report(self.run)
+        return write_report(self.recorded)
 
     @property
     def _doubts(self) -> list[str]:
-        return doubts(self.run.cases, self.run.criterion, self.run.settings.in_vain)
+        return doubts(self.recorded.cases, self.recorded.criterion, self.recorded.settings.in_vain)
 
     def to_record(self) -> dict[str, Any]:
         """Return the object that `merge-sumo campaign --json` prints.
@@ -186,8 +188,8 @@ class CampaignRun(Result):
         the uniform starts of each level, of which `failures` fail and `without_verdict` are not
         judged; `worst_case` is the index of the failure with the lowest margin.
         """
-        shares, worst = SHARES.read(self.folder), failures(self.run.cases)
-        criterion, at_limits = self.run.criterion, mostly_clipped(self.run.cases)
+        shares, worst = SHARES.read(self.folder), failures(self.recorded.cases)
+        criterion, at_limits = self.recorded.criterion, mostly_clipped(self.recorded.cases)
         return {
             **to_plain(self.summary),
             **self.verdict.to_record(),
@@ -196,7 +198,7 @@ class CampaignRun(Result):
             "gates": {gate.name: gate.met for gate in self.gates},
             "passed": self.passed,
             "stopped": "converged" if self.converged else "cases",
-            "fail_when": criterion.text,
+            "fail_when": criterion.as_written,
             "notes": [*filter(None, [at_limits]), *self._doubts],
             **({} if self.against is None else {AGAINST: self.against.steps[0].to_record()}),
             "repeats": to_plain(self.repeats),
@@ -206,7 +208,7 @@ class CampaignRun(Result):
 
     def lines(self) -> list[str]:
         """Return the headline, remarks, and the path of the report."""
-        run = self.run
+        run = self.recorded
         repeated = [
             f"{fact.name}: {fact.shown}"
             for fact in self.facts
@@ -217,7 +219,7 @@ class CampaignRun(Result):
             unrepeatable(self.repeats),
             tested,
             mostly_clipped(run.cases),
-            *self.verdict.trouble_lines(),
+            *self.verdict.error_lines(),
             *found,
             *repeated,
             run.ran_again_in_words if run.settings.ran_again else None,
@@ -230,7 +232,7 @@ class CampaignRun(Result):
     def _against_lines(self) -> list[str]:
         if self.against is None:
             return []
-        earlier = printable(str(self.run.settings.against)[:NAME_CHARACTERS])
+        earlier = printable(str(self.recorded.settings.against)[:NAME_CHARACTERS])
         return [
             f"against {earlier}: {comparison_headline(self.against)}",
             *transitions(self.against.steps[0]),
@@ -295,11 +297,11 @@ def campaign_of(run: AnyRun) -> CampaignRun:
     return run if isinstance(run, CampaignRun) else CampaignRun(folder_of(run))
 
 
-def recorded(run: AnyRun) -> Run:
+def recorded(run: AnyRun) -> RecordedCampaign:
     """Open a campaign, or a cases file."""
     path = folder_of(run)
     is_file = not path.is_dir() and (path.suffix == SUFFIX or path.exists())
-    return CasesFile(path) if is_file else campaign_of(run).run
+    return CasesFile(path) if is_file else campaign_of(run).recorded
 
 
 def folder_of(run: AnyRun) -> Path:

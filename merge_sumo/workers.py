@@ -249,7 +249,7 @@ def open_workers(workers: AnyWorkers = None) -> Workers:
     return Workers() if count == 1 else Workers(LocalProcesses, count)
 
 
-def workers_or_here(workers: Workers | None) -> AbstractContextManager[Workers]:
+def workers_or_serial(workers: Workers | None) -> AbstractContextManager[Workers]:
     """Give workers, which stay open, or this process as the only one."""
     return open_workers(1) if workers is None else nullcontext(workers)
 

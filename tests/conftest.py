@@ -19,7 +19,7 @@ from threadpoolctl import threadpool_limits
 
 from merge_sumo import cli
 from merge_sumo.analysis import share
-from merge_sumo.campaigns.run import Run
+from merge_sumo.campaigns.recorded import RecordedCampaign
 from merge_sumo.road.corridor import Corridor
 from merge_sumo.simulation import evaluate
 
@@ -70,7 +70,7 @@ def no_simulation_left() -> Iterator[None]:
 
 
 @pytest.fixture(scope="session")
-def run(tmp_path_factory) -> Run:
+def run(tmp_path_factory) -> RecordedCampaign:
     """Return a small finished campaign with failures: design1 against level 0."""
     settings = campaign_settings(vut="design1", cases=60, batch=20, seed=1)
     return run_campaign(settings, tmp_path_factory.mktemp("campaign") / "run")

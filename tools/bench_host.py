@@ -36,8 +36,8 @@ from merge_sumo.scenario.trajectory import Trajectory
 from merge_sumo.simulation.povs import PovLibrary, Povs
 from merge_sumo.simulation.rollout import Rollout
 from merge_sumo.sumo.binding import NO_COLLISIONS, SPEED_MODE_COMMANDED, SUMO_OPTIONS, sumo_program
-from merge_sumo.sumo.hosting import HostedPath, hosted_net, hosted_paths
-from merge_sumo.sumo.world import MAX_SPEED_MPS, World
+from merge_sumo.sumo.net_copies import HostedPath, hosted_net, hosted_paths
+from merge_sumo.sumo.sumo_simulation import MAX_SPEED_MPS, SumoSimulation
 
 KS = (1, 8, 32, 64)
 STEPS = 80
@@ -46,24 +46,26 @@ WAVES = 20
 VUT = "design1"
 
 
-def host_s(world: World, cases: list[Case]) -> tuple[float, list[Trajectory]]:
+def host_s(simulation: SumoSimulation, cases: list[Case]) -> tuple[float, list[Trajectory]]:
     """Return the seconds that the host takes for cases, and the trajectories."""
-    pov = PovLibrary(world.corridors * (world.vehicles - 1), Povs(policies=policies_of(US23)))
-    vut = load(VUT).open(world.corridors)
+    pov = PovLibrary(
+        simulation.corridors * (simulation.vehicles - 1), Povs(policies=policies_of(US23))
+    )
+    vut = load(VUT).open(simulation.corridors)
     start = time.perf_counter()
-    trajectories = Rollout(world, pov, vut, cases).run()
+    trajectories = Rollout(simulation, pov, vut, cases).run()
     return time.perf_counter() - start, trajectories
 
 
-def bare_s_per_step(world: World, trajectories: list[Trajectory]) -> float:
+def bare_s_per_step(simulation: SumoSimulation, trajectories: list[Trajectory]) -> float:
     """Return the seconds per step and corridor of a plain loop that moves vehicles as recorded."""
     # The same functions that the host calls: without the Python wrappers around them.
     raw = libsumo._libsumo
     set_speed, set_previous_speed = raw.vehicle_setSpeed, raw.vehicle_setPreviousSpeed
     get_position, get_speed = raw.vehicle_getLanePosition, raw.vehicle_getSpeed
     step = libsumo.simulation.step
-    corridors = world.corridors
-    names = [f"{who}.{k}" for who in VEHICLES[: world.vehicles] for k in range(corridors)]
+    corridors = simulation.corridors
+    names = [f"{who}.{k}" for who in VEHICLES[: simulation.vehicles] for k in range(corridors)]
     spent = 0.0
     waves = [
         trajectories[i : i + corridors]
@@ -71,7 +73,7 @@ def bare_s_per_step(world: World, trajectories: list[Trajectory]) -> float:
     ]
     for wave in waves:
         for k, trajectory in enumerate(wave):
-            world.place(k, trajectory.case.starts())
+            simulation.place(k, trajectory.case.starts())
         # By step, then vehicle by vehicle, each in all corridors.
         motion = np.stack([trajectory.motion[: STEPS + 1] for trajectory in wave], axis=2)
         speeds = motion[..., 1].reshape(STEPS + 1, -1).tolist()
@@ -90,19 +92,19 @@ def bare_s_per_step(world: World, trajectories: list[Trajectory]) -> float:
     return spent / (len(waves) * corridors * STEPS)
 
 
-def step_s_per_step(world: World, cases: list[Case]) -> float:
+def step_s_per_step(simulation: SumoSimulation, cases: list[Case]) -> float:
     """Return the seconds per step and corridor of SUMO alone."""
     step = libsumo.simulation.step
     spent = 0.0
     for wave in range(WAVES):
-        for k in range(world.corridors):
-            case = cases[(wave * world.corridors + k) % len(cases)]
-            world.place(k, case.starts())
+        for k in range(simulation.corridors):
+            case = cases[(wave * simulation.corridors + k) % len(cases)]
+            simulation.place(k, case.starts())
         start = time.perf_counter()
         for _ in range(STEPS):
             step()
         spent += time.perf_counter() - start
-    return spent / (WAVES * world.corridors * STEPS)
+    return spent / (WAVES * simulation.corridors * STEPS)
 
 
 def process_s(cases: list[Case]) -> list[float]:
@@ -181,18 +183,18 @@ def cases_of(scenario: Scenario, count: int) -> list[Case]:
 
 
 def measured(scenario: Scenario, k: int, count: int, rounds: int) -> dict[str, list[float]]:
-    """Return the figures of each round in a world with `k` corridors."""
+    """Return the figures of each round in a simulation with `k` corridors."""
     row: dict[str, list[float]] = {"us": [], "cases_per_s": [], "to_bare": [], "to_step": []}
     cases = cases_of(scenario, count * min(k, 32) // 32)
-    with World(k, scenario=scenario) as world:
-        host_s(world, cases[:k])
+    with SumoSimulation(k, scenario=scenario) as simulation:
+        host_s(simulation, cases[:k])
         for _ in range(rounds):
-            seconds, trajectories = host_s(world, cases)
+            seconds, trajectories = host_s(simulation, cases)
             us = seconds / sum(len(t.whole) - 1 for t in trajectories) * 1e6
             row["us"].append(us)
             row["cases_per_s"].append(len(cases) / seconds)
-            row["to_bare"].append(us / bare_s_per_step(world, trajectories) / 1e6)
-            row["to_step"].append(us / step_s_per_step(world, cases) / 1e6)
+            row["to_bare"].append(us / bare_s_per_step(simulation, trajectories) / 1e6)
+            row["to_step"].append(us / step_s_per_step(simulation, cases) / 1e6)
     return row
 
 

@@ -21,7 +21,7 @@ from measuring import append_record, benchmark_parser
 
 from merge_sumo.drivers import lane
 from merge_sumo.drivers.base import MERGE, STAY, Driver, Scene
-from merge_sumo.drivers.lane import LanePov, acc_mps2, idm_mps2
+from merge_sumo.drivers.lane import PovAfterMerge, acc_mps2, idm_mps2
 from merge_sumo.drivers.level0 import Level0Pov, Level0Vut
 from merge_sumo.drivers.policies import load_driver
 from merge_sumo.metrics.merge import brake_after_mps2
@@ -30,7 +30,7 @@ from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.scenario.case import Case, FloatArray, from_unit
 from merge_sumo.scenario.scenario import DT_S, US23, Bounds
 from merge_sumo.scenario.trajectory import Trajectory
-from merge_sumo.simulation.kinematic_world import EquationWorld
+from merge_sumo.simulation.kinematic_simulation import KinematicSimulation
 from merge_sumo.simulation.rollout import Rollout
 from merge_sumo.training.best_response import best_response
 from merge_sumo.training.check import returns_of
@@ -45,20 +45,20 @@ class MergesAt(Level0Vut):
         """Take the place."""
         super().__init__(corridors)
         self._place_m = place_m
-        self._wishes = np.zeros(corridors, dtype=np.int8)
+        self._merge_requests = np.zeros(corridors, dtype=np.int8)
 
     def act(self, scene: Scene) -> FloatArray:
         """Return the accelerations, (K,)."""
         next_m = scene.x_vut_m + scene.v_vut_mps * DT_S
-        self._wishes = np.where(next_m >= self._place_m, MERGE, STAY).astype(np.int8)
+        self._merge_requests = np.where(next_m >= self._place_m, MERGE, STAY).astype(np.int8)
         return super().act(scene)
 
 
 def played(cases: Sequence[Case], pov: Driver, vut: Driver) -> list[Trajectory]:
     """Return what happens in cases of one scenario, in their order."""
     scenario = cases[0].scenario
-    world = EquationWorld(pov.corridors, road_for(scenario), scenario)
-    ended = Rollout(world, pov, vut, cases).run()
+    simulation = KinematicSimulation(pov.corridors, road_for(scenario), scenario)
+    ended = Rollout(simulation, pov, vut, cases).run()
     return [ended[place] for place in range(len(cases))]
 
 
@@ -83,7 +83,7 @@ def regrets(cases: Sequence[Case], lane_m: Bounds) -> dict[str, float]:
     for place_m in (lane_m[0], 0.0, 0.5 * lane_m[1], lane_m[1]):
         vut = MergesAt(k, place_m)
         reached, unmoved = (
-            returns_of(played(cases, LanePov(pov), vut), reward)
+            returns_of(played(cases, PovAfterMerge(pov), vut), reward)
             for pov in (load_driver("pov1", k), Level0Pov(k))
         )
         shifted = starts - np.array([place_m, 0.0, place_m, 0.0])
@@ -104,7 +104,7 @@ def hard_braking(cases: Sequence[Case]) -> dict[str, int]:
     found = {}
     print("followers   merges that need at most 1 m/s2   harder than 3 m/s2 after them")
     for name, follow in (("ACC", acc_mps2), ("IDM", idm)):
-        pov = LanePov(Level0Pov(len(cases)))
+        pov = PovAfterMerge(Level0Pov(len(cases)))
         lane.acc_mps2 = follow  # type: ignore[assignment]
         merges = played(cases, pov, MergesAt(len(cases), 0.0))
         easy = [one for one in merges if 0.0 < brake_after_mps2(one) <= 1.0]

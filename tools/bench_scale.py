@@ -46,7 +46,7 @@ from merge_sumo.campaigns.campaign import run_campaign
 from merge_sumo.campaigns.journal import Journal, to_line
 from merge_sumo.campaigns.loop import SearchLoop
 from merge_sumo.campaigns.plan import resolve
-from merge_sumo.campaigns.run import OUTCOMES, Run, failures, read_outcomes
+from merge_sumo.campaigns.recorded import OUTCOMES, RecordedCampaign, failures, read_outcomes
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.metrics.fmc import fmc, regions
 from merge_sumo.metrics.outcome import Episode
@@ -320,7 +320,7 @@ def files(most: int) -> Figures:
     return figures
 
 
-def of_files(run: Run, outcomes: list[Any]) -> dict[str, float]:
+def of_files(run: RecordedCampaign, outcomes: list[Any]) -> dict[str, float]:
     """Return sizes in MB, and seconds for reading, FMC, regions and report of outcomes."""
     run.outcomes = outcomes
     text = "".join(map(to_line, outcomes)).encode()

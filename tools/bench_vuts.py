@@ -36,7 +36,7 @@ from merge_sumo.road.merge import road_of
 from merge_sumo.scenario.case import Case
 from merge_sumo.scenario.scenario import DT_S, US23
 from merge_sumo.sumo.binding import SUMO_OPTIONS, sumo_program
-from merge_sumo.sumo.world import World
+from merge_sumo.sumo.sumo_simulation import SumoSimulation
 
 STEPS = 80
 """Of an episode."""
@@ -164,12 +164,12 @@ PEERS = {
 """Kinds that are divided by another one."""
 
 
-def opened(folder: Path, world: World) -> dict[str, Driver]:
+def opened(folder: Path, simulation: SumoSimulation) -> dict[str, Driver]:
     """Write the controllers of all kinds into a folder, and return their drivers by name.
 
     Args:
         folder: folder of the controllers.
-        world: a world, of which a TraCI controller is told road and scenario.
+        simulation: a simulation, of which a TraCI controller is told road and scenario.
     """
     (folder / "law.py").write_text(LAW)
     (folder / "client.py").write_text(CLIENT)
@@ -184,7 +184,7 @@ def opened(folder: Path, world: World) -> dict[str, Driver]:
     in_process = ControllerOptions(in_process=True)
 
     def driver(spec: str, corridors: int = 1, options: ControllerOptions | None = None) -> Driver:
-        return load(spec, options or ControllerOptions()).open(corridors, world)
+        return load(spec, options or ControllerOptions()).open(corridors, simulation)
 
     return {
         "python": driver(law),
@@ -207,7 +207,7 @@ def main() -> None:
     us: dict[str, list[float]] = defaultdict(list)
     with tempfile.TemporaryDirectory() as name, ExitStack() as open_drivers:
         folder = Path(name)
-        drivers = opened(folder, open_drivers.enter_context(World(1, scenario=US23)))
+        drivers = opened(folder, open_drivers.enter_context(SumoSimulation(1, scenario=US23)))
         for driver in drivers.values():
             open_drivers.callback(driver.close)
         for _ in range(options.rounds):

@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 
 import merge_sumo as ms
 from merge_sumo.campaigns.plan import resolve
-from merge_sumo.campaigns.run import Run
+from merge_sumo.campaigns.recorded import RecordedCampaign
 from merge_sumo.campaigns.settings import CampaignSettings, settings_of
 from merge_sumo.errors import UserError
 from merge_sumo.road.corridor import Corridor
@@ -38,10 +38,10 @@ from merge_sumo.scenario.case import Case, FloatArray
 from merge_sumo.scenario.scenario import DT_S, VEHICLES, VUT, Scenario
 from merge_sumo.scenario.trajectory import Trajectory
 from merge_sumo.simulation.evaluate import simulate
-from merge_sumo.simulation.kinematic_world import EquationWorld
+from merge_sumo.simulation.kinematic_simulation import KinematicSimulation
 from merge_sumo.simulation.plan import SimulationPlan
 from merge_sumo.simulation.simulator import Simulator, corridors_of
-from merge_sumo.sumo.world import MAX_SPEED_MPS
+from merge_sumo.sumo.sumo_simulation import MAX_SPEED_MPS
 
 AGREED: Final = 1e-6
 """Positions and speeds this near to each other, in m and m/s, are the same. Measured: 5e-12."""
@@ -53,10 +53,11 @@ MOVES_OTHERWISE: Final = "its vehicles move otherwise"
 """The reason that is a difference of the simulators."""
 
 
-class HighwayEnvWorld(EquationWorld):
+class HighwayEnvWorld(KinematicSimulation):
     """The state of the vehicles in `corridors` independent corridors, moved by HighwayEnv.
 
-    `x_m` and `v_mps` have shape (A, corridors), as those of a `World`: read from its vehicles.
+    `x_m` and `v_mps` have shape (A, corridors), as those of a `SumoSimulation`, and are read from
+    its vehicles.
     """
 
     def __init__(self, corridors: int, road: Corridor, scenario: Scenario) -> None:
@@ -128,8 +129,10 @@ class HighwayEnvSimulator(Simulator):
 
     def __init__(self, plan: SimulationPlan) -> None:
         with ExitStack() as opened:
-            world = HighwayEnvWorld(corridors_of(plan, plan.corridors), plan.road, plan.scenario)
-            self._open_drivers(plan, world, opened)
+            simulation = HighwayEnvWorld(
+                corridors_of(plan, plan.corridors), plan.road, plan.scenario
+            )
+            self._open_drivers(plan, simulation, opened)
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,7 +160,7 @@ class Crosscheck:
         return max(self.largest_m, self.largest_mps) <= AGREED and not moves
 
 
-def crosscheck(run: Run, cases: int, seed: int) -> Crosscheck:
+def crosscheck(run: RecordedCampaign, cases: int, seed: int) -> Crosscheck:
     """Let HighwayEnv repeat the cases of a campaign, and fresh uniform ones up to `cases`."""
     settings = settings_of(run.folder, run.record)
     plan = resolve(settings)
@@ -196,7 +199,7 @@ def uniform(settings: CampaignSettings, count: int, seed: int) -> list[Case]:
 
 def failed(plan: SimulationPlan, trajectory: Trajectory) -> bool:
     """Return whether a case fails by the criterion of the campaign."""
-    return plan.criterion.judged(trajectory, centre_lines(plan.road)).failed
+    return plan.criterion.bare_outcome(trajectory, centre_lines(plan.road)).failed
 
 
 def largest_deviations(plan: SimulationPlan, known: Sequence[Trajectory]) -> tuple[float, float]:
@@ -204,20 +207,20 @@ def largest_deviations(plan: SimulationPlan, known: Sequence[Trajectory]) -> tup
     off = np.zeros(2)
     for first in range(0, len(known), CHUNK):
         motions = [one.motion for one in known[first : first + CHUNK]]
-        world = HighwayEnvWorld(len(motions), plan.road, plan.scenario)
+        simulation = HighwayEnvWorld(len(motions), plan.road, plan.scenario)
         for corridor, motion in enumerate(motions):
-            world.place(corridor, motion[0, :, :2].tolist())
+            simulation.place(corridor, motion[0, :, :2].tolist())
         for step in range(1, max(map(len, motions))):
-            a_mps2 = np.zeros_like(world.x_m)
+            a_mps2 = np.zeros_like(simulation.x_m)
             running = [k for k, motion in enumerate(motions) if step < len(motion)]
             for k in running:
                 a_mps2[:, k] = motions[k][step - 1, :, 2]
-            world.command(a_mps2)
+            simulation.command(a_mps2)
             for k in running:
-                state = np.array((world.x_m[:, k], world.v_mps[:, k])).T
+                state = np.array((simulation.x_m[:, k], simulation.v_mps[:, k])).T
                 off = np.maximum(off, np.abs(state - motions[k][step, :, :2]).max(axis=0))
                 if step == len(motions[k]) - 1:
-                    world.park(k)
+                    simulation.park(k)
     return float(off[0]), float(off[1])
 
 
@@ -245,7 +248,7 @@ def main() -> int:
     options = parser.parse_args()
     try:
         peer = f"HighwayEnv {version('highway-env')}"
-        found = crosscheck(ms.open_run(options.run).run, options.cases, options.seed)
+        found = crosscheck(ms.open_run(options.recorded).recorded, options.cases, options.seed)
     except ImportError:
         print("this needs highway-env: run `pip install 'merge-sumo[peers]'`", file=sys.stderr)
         return 2

@@ -159,7 +159,7 @@ class FrozenKind(ControllerKind):
         if spec.argument not in FROZEN_VUTS:
             raise UserError(f"there is no VUT {spec}: {meant(spec.argument, FROZEN_VUTS)}")
 
-    def driver(self, corridors: int, _world: object) -> Driver:
+    def driver(self, corridors: int, _simulation: object) -> Driver:
         """Return its driver."""
         return FROZEN_VUTS[self.spec.argument](corridors)
 

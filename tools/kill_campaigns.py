@@ -29,7 +29,7 @@ import numpy as np
 from merge_sumo.campaigns import journal
 from merge_sumo.campaigns.campaign import run_campaign
 from merge_sumo.campaigns.plan import resolve
-from merge_sumo.campaigns.run import OUTCOMES, SETTINGS, read_settings
+from merge_sumo.campaigns.recorded import OUTCOMES, SETTINGS, read_settings
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.campaigns.settings import settings_of as settings_in
 from merge_sumo.scenario.scenario import US23

@@ -19,7 +19,7 @@ from pathlib import Path
 from lxml import etree
 from playwright.sync_api import sync_playwright
 
-from merge_sumo.campaigns.run import Run
+from merge_sumo.campaigns.recorded import RecordedCampaign
 from merge_sumo.files import check_new
 from merge_sumo.reports.report import write_report
 from merge_sumo.sumo.binding import run_program
@@ -34,7 +34,7 @@ def picture_of_report(run: Path, picture: Path, _: float) -> None:
     program = shutil.which("chromium") or shutil.which("google-chrome")
     if program is None:
         sys.exit("chromium is not on the PATH: run `apt-get install chromium`")
-    report = write_report(Run(run))
+    report = write_report(RecordedCampaign(run))
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=program, args=["--no-sandbox"])
         page = browser.new_page(viewport=WINDOW_PX)  # type: ignore[arg-type]

@@ -124,7 +124,7 @@ def main() -> None:
         dx = "" if measures.dx_m is None else f", dx {measures.dx_m:.1f} m"
         if case.scenario.vehicles > 2:
             dx += f" to the car {measures.nearest}" if measures.nearest != "pov" else " to the POV"
-        title = f"{pov}, VUT {example.vut}: {measures.became.lower()}{dx}"
+        title = f"{pov}, VUT {example.vut}: {measures.result.lower()}{dx}"
         draw(trajectory, title, folder / "motion.png")
         print(
             f"{name}: {title}; hardest braking of the VUT {measures.vut_max_brake_mps2:.1f}, "

@@ -11,7 +11,7 @@ from typing import Annotated, Any
 from msgspec import Meta
 
 from merge_sumo.analysis.comparison import Change, ComparedCase, passes, short
-from merge_sumo.campaigns.run import Run
+from merge_sumo.campaigns.recorded import RecordedCampaign
 from merge_sumo.errors import UserError
 from merge_sumo.metrics.criterion import PAPER_CRITERION, Criterion
 from merge_sumo.metrics.measures import Measures, measures_in
@@ -42,7 +42,7 @@ class Head(Record, frozen=True):
     tolerance: Annotated[float, Meta(ge=0.0, le=1000.0)] = TOLERANCE
 
 
-class CasesFile(Run):
+class CasesFile(RecordedCampaign):
     """A cases file, as a campaign of which only what decided its cases is recorded.
 
     Example:
@@ -136,7 +136,7 @@ def verdict_of(outcome: Outcome) -> str:
     return "error" if outcome.measures.end.is_error else "timeout"
 
 
-def policies_of(run: Run, outcomes: Iterable[Outcome]) -> dict[str, str] | None:
+def policies_of(run: RecordedCampaign, outcomes: Iterable[Outcome]) -> dict[str, str] | None:
     """Return the hashes of the learned POVs of some cases, as a campaign records them."""
     learned = {POLICIES.get(outcome.case.level) for outcome in outcomes}
     known = run.record.get("policies_sha256") or {}

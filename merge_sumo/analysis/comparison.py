@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from merge_sumo.campaigns.again import command
-from merge_sumo.campaigns.run import Run
+from merge_sumo.campaigns.recorded import RecordedCampaign
 from merge_sumo.campaigns.settings import same_pov
 from merge_sumo.errors import UserError
 from merge_sumo.files import free
@@ -68,7 +68,7 @@ class Version:
     sampler: str
 
     @classmethod
-    def of(cls, run: Run) -> Version:
+    def of(cls, run: RecordedCampaign) -> Version:
         """Return a campaign as a version."""
         return cls(
             vut=run.vut,
@@ -125,7 +125,7 @@ def short(value: Any) -> Any:
 
 def outcome_word(outcome: Outcome) -> str:
     """Return how a case ended, in words."""
-    return outcome.measures.became.lower().replace("_", " ")
+    return outcome.measures.result.lower().replace("_", " ")
 
 
 def cut(number: int, most: int) -> str:
@@ -345,7 +345,7 @@ class Comparison(Result):
         }
 
 
-def compare(runs: Sequence[Run]) -> Comparison:
+def compare(runs: Sequence[RecordedCampaign]) -> Comparison:
     """Compare recorded campaigns, the oldest first; nothing runs.
 
     Raises:
@@ -378,7 +378,7 @@ def compare(runs: Sequence[Run]) -> Comparison:
     )
 
 
-def compare_against(run: Run) -> Comparison | None:
+def compare_against(run: RecordedCampaign) -> Comparison | None:
     """Compare the VUT of a campaign with the earlier version of `--against`, in the same cases.
 
     Returns:
@@ -406,7 +406,7 @@ def of_two(before: Version, after: Version, source: str) -> Comparison:
     return Comparison((before, after), (_step((before, after), 1),), source)
 
 
-def _check_comparable(a: Run, b: Run) -> None:
+def _check_comparable(a: RecordedCampaign, b: RecordedCampaign) -> None:
     differs = {
         "the scenario": a.scenario != b.scenario,
         "what counts as a failure": a.criterion != b.criterion,

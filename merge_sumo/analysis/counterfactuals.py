@@ -21,7 +21,7 @@ from typing import Any, Literal
 import numpy as np
 
 from merge_sumo.analysis.run_study import RunStudy, StudyFile
-from merge_sumo.campaigns.run import Run, failures
+from merge_sumo.campaigns.recorded import RecordedCampaign, failures
 from merge_sumo.controllers.kinds import load
 from merge_sumo.controllers.process import LOG
 from merge_sumo.drivers.base import MERGE, STAY, Driver, DriverWrapper, Scene
@@ -82,7 +82,7 @@ AVOIDANCE = StudyFile("avoidance.jsonl", Avoidance)
 """A line for each failure, up to `MOST`."""
 
 
-def causes(run: Run, outcomes: Sequence[Outcome]) -> dict[int, str]:
+def causes(run: RecordedCampaign, outcomes: Sequence[Outcome]) -> dict[int, str]:
     """Return the causes of cases of a campaign by index, with the drivers that avoid them."""
     motions = run.trajectories(outcome.index for outcome in outcomes)
     clauses = {one.index: one.clause for one in AVOIDANCE.read_lines(run)}
@@ -221,10 +221,10 @@ def _latest_takeovers(
 def _passed(
     plan: SimulationPlan, simulator: Simulator, cases: Sequence[Counterfactual]
 ) -> list[bool]:
-    """Run counterfactuals in the world of a simulator; return whether each passes."""
-    world = simulator.world
-    substitutes = _Substitutes(world.corridors)
-    trajectories = Rollout(world, _Mainline(simulator.pov), substitutes, cases).run()
+    """Run counterfactuals in the simulation of a simulator; return whether each passes."""
+    simulation = simulator.simulation
+    substitutes = _Substitutes(simulation.corridors)
+    trajectories = Rollout(simulation, _Mainline(simulator.pov), substitutes, cases).run()
     lines = centre_lines(plan.road)
     passed = []
     for case, trajectory in zip(cases, trajectories, strict=True):
@@ -232,7 +232,7 @@ def _passed(
         # A merge after which the vehicle behind cannot brake hard enough avoids nothing.
         can_brake = brake_after_mps2(whole) <= -case.scenario.a_min_mps2
         tested = can_brake and whole.end.is_tested
-        passed.append(tested and not plan.criterion.judged(whole, lines).failed)
+        passed.append(tested and not plan.criterion.bare_outcome(whole, lines).failed)
     return passed
 
 
@@ -276,7 +276,7 @@ class _Substitutes(Driver):
         # On an acceleration lane: where the VUT of the failure merged, then at M.
         at_m = scene.x_vut_m + scene.v_vut_mps * DT_S >= 0.0
         merges = np.where(is_recorded, scene.step >= self._merges_at, at_m)
-        self._wishes = np.where(merges, MERGE, STAY).astype(np.int8)
+        self._merge_requests = np.where(merges, MERGE, STAY).astype(np.int8)
         return answer
 
 

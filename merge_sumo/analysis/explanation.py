@@ -14,7 +14,7 @@ from typing import Annotated, Any
 from msgspec import Meta
 
 from merge_sumo.analysis.run_study import RunStudy, StudyFile
-from merge_sumo.campaigns.run import Run, failures
+from merge_sumo.campaigns.recorded import RecordedCampaign, failures
 from merge_sumo.controllers.parameters import Range, values_of
 from merge_sumo.controllers.spec import ControllerSpec
 from merge_sumo.errors import UserError
@@ -139,7 +139,7 @@ class ExplanationResult(Result):
         found: the changes.
     """
 
-    run: Run
+    run: RecordedCampaign
     found: Explanation
 
     def to_record(self) -> dict[str, Any]:
@@ -147,7 +147,7 @@ class ExplanationResult(Result):
         return {**to_plain(self.found), "file": str(self.run.folder / EXPLANATIONS.name)}
 
 
-def failure_of(run: Run, index: int | None) -> Outcome:
+def failure_of(run: RecordedCampaign, index: int | None) -> Outcome:
     """Return a failure of a campaign by its index, by default the worst.
 
     Raises:
@@ -205,7 +205,7 @@ def explain(
     return ExplanationResult(study.run, found)
 
 
-def _write(run: Run, found: Explanation) -> None:
+def _write(run: RecordedCampaign, found: Explanation) -> None:
     """Write an explanation next to those of other cases and other VUTs."""
     kept = [one for one in EXPLANATIONS.read_lines(run) if one.key != found.key]
     EXPLANATIONS.write_lines(run.folder, sorted([*kept, found], key=lambda one: one.key))

@@ -18,8 +18,8 @@ from merge_sumo.analysis.comparison import (
 )
 from merge_sumo.analysis.run_study import RunStudy
 from merge_sumo.campaigns.again import command
+from merge_sumo.campaigns.recorded import RecordedCampaign
 from merge_sumo.campaigns.repeats import others_drive, repeat_of, unrepeatable
-from merge_sumo.campaigns.run import Run
 from merge_sumo.errors import UserError
 from merge_sumo.files import free
 from merge_sumo.metrics.outcome import Episode, Outcome
@@ -31,7 +31,9 @@ AGAIN = (Change.BROKE, Change.WORSE, Change.STILL_CONTACT, Change.FIXED)
 """Changes whose cases run a second time, where a controller drives that may not repeat itself."""
 
 
-def chosen(run: Run, indices: Sequence[int], level: AnyLevels = "all") -> list[Outcome]:
+def chosen(
+    run: RecordedCampaign, indices: Sequence[int], level: AnyLevels = "all"
+) -> list[Outcome]:
     """Return cases of a campaign by their indices and levels.
 
     Args:

@@ -7,10 +7,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
-from merge_sumo.campaigns.run import Run
+from merge_sumo.campaigns.recorded import RecordedCampaign
 from merge_sumo.campaigns.settings import CampaignSettings, record_of, same_pov
 from merge_sumo.errors import UserError, notice
-from merge_sumo.files import check_ours, files_now, replace_own
+from merge_sumo.files import check_generated, files_now, replace_own
 from merge_sumo.metrics.outcome import Episode
 from merge_sumo.printable import printable
 from merge_sumo.records import Record, read_indexed, read_record, to_json
@@ -42,7 +42,7 @@ class StudyFile(Generic[R]):
 
     def check(self, folder: Path) -> None:
         """Raise `UserError` where a file of this name was not created by merge-sumo."""
-        check_ours(folder / self.name, self._mark)
+        check_generated(folder / self.name, self._mark)
 
     def read(self, folder: Path) -> R | None:
         """Read the record; None without the file, `UserError` where it is not as it was written."""
@@ -52,7 +52,7 @@ class StudyFile(Generic[R]):
         """Write the record, in the place of an older one."""
         replace_own(folder / self.name, to_json(record, indent=1), self._mark)
 
-    def read_lines(self, run: Run) -> list[R]:
+    def read_lines(self, run: RecordedCampaign) -> list[R]:
         """Read the lines; `UserError` for one that is not of a failure of the campaign."""
         failing = {outcome.index for outcome in run.outcomes if outcome.failed}
         return read_indexed(run.folder / self.name, self.kind, failing)
@@ -98,7 +98,7 @@ class RunStudy:
         on_cases: called with the number of cases that have just ended.
     """
 
-    run: Run
+    run: RecordedCampaign
     settings: CampaignSettings
     plan: SimulationPlan
     workers: Workers = field(default_factory=Workers)
@@ -144,7 +144,7 @@ class RunStudy:
             notice_changes(run, self.plan)
 
 
-def notice_changes(run: Run, plan: SimulationPlan) -> None:
+def notice_changes(run: RecordedCampaign, plan: SimulationPlan) -> None:
     """Warn with a `Notice` where the files of a controller have changed since a campaign."""
     controllers = [(plan.vut, run.settings.vut, run.settings.vut_files)]
     if plan.povs.own is not None:

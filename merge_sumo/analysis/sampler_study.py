@@ -27,7 +27,7 @@ from merge_sumo.analysis.truth import (
 from merge_sumo.campaigns.campaign import controller_model_of
 from merge_sumo.campaigns.loop import Groups, SearchLoop
 from merge_sumo.campaigns.settings import CampaignSettings
-from merge_sumo.controllers.in_memory import is_here
+from merge_sumo.controllers.in_memory import is_in_process
 from merge_sumo.errors import UserError, notice
 from merge_sumo.metrics.fmc import covered, fmc
 from merge_sumo.metrics.outcome import Outcome
@@ -175,7 +175,7 @@ class Study:
         by_level = {
             level: self.truth(level, options.cases, options.seed) for level in settings.levels
         }
-        if not self.plan.vut.files_are_known and not is_here(settings.vut):
+        if not self.plan.vut.files_are_known and not is_in_process(settings.vut):
             notice(
                 "merge-sumo does not know which files the program of this VUT loads; this truth is "
                 "kept for its command and the files that are named there"

@@ -15,7 +15,7 @@ import numpy as np
 from msgspec import Meta
 
 from merge_sumo.analysis.run_study import RunStudy, StudyFile, end_of
-from merge_sumo.campaigns.run import Run
+from merge_sumo.campaigns.recorded import RecordedCampaign
 from merge_sumo.controllers.process import LOG
 from merge_sumo.errors import UserError
 from merge_sumo.metrics.summary import clopper_pearson, undecided
@@ -23,7 +23,7 @@ from merge_sumo.records import Record
 from merge_sumo.scenario.case import Case, Pool
 from merge_sumo.scenario.scenario import Scenario
 from merge_sumo.simulation.evaluate import evaluate
-from merge_sumo.workers import workers_or_here
+from merge_sumo.workers import workers_or_serial
 
 CASES = 2000
 """Uniform cases of a level: 0 failures among them are less than .15 % of all starts."""
@@ -82,7 +82,7 @@ class Shares(Record, frozen=True):
 SHARES = StudyFile("shares.json", Shares)
 
 
-def own_shares(run: Run) -> list[LevelShare]:
+def own_shares(run: RecordedCampaign) -> list[LevelShare]:
     """Return the share of the cases of a campaign that fail; undecided ones have no verdict.
 
     It is that of all starts where the campaign drew its cases uniformly.
@@ -124,7 +124,7 @@ def note_shares(
     plan = plan.for_verdicts().with_engine(None).with_log(run.folder.resolve() / LOG)
     shares: list[LevelShare] = []
     # Worker processes would take longer to start than the cases by the equations of motion.
-    with workers_or_here(None if by_equations else study.workers) as workers:
+    with workers_or_serial(None if by_equations else study.workers) as workers:
         for level in run.levels:
             on_part(len(shares) * count, len(run.levels) * count)
             cases = uniform_cases(plan.scenario, level, count, run.settings.seed)

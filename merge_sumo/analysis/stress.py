@@ -15,7 +15,7 @@ import numpy as np
 from msgspec import Meta
 
 from merge_sumo.analysis.run_study import RunStudy, StudyFile
-from merge_sumo.campaigns.run import failures
+from merge_sumo.campaigns.recorded import failures
 from merge_sumo.errors import UserError
 from merge_sumo.metrics.outcome import Episode, Outcome
 from merge_sumo.records import Record

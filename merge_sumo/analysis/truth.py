@@ -290,7 +290,7 @@ class TruthResult(Result):
 
     def to_record(self) -> dict[str, Any]:
         """Return what `--json` prints: that of the level, or sums with a list of the levels."""
-        same = {"vut": self.vut, "fail_when": self.criterion.text}
+        same = {"vut": self.vut, "fail_when": self.criterion.as_written}
         levels = [{**same, "level": one, **of.to_record()} for one, of in self.truths.items()]
         if len(levels) == 1:
             return levels[0]

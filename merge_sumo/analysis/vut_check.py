@@ -115,7 +115,7 @@ def _checked(simulator: Simulator, plan: SimulationPlan) -> tuple[list[str], lis
         problems += _differences("the same cases in another order", first, backwards)
         alone = [simulator.run([case])[0] for case in cases]
         problems += _differences("each case alone", first, alone)
-        for corridor in range(simulator.world.corridors):
+        for corridor in range(simulator.simulation.corridors):
             simulator.vut.begin(corridor, from_standstill)
         problems += _differences("one more reset", first, simulator.run(cases))
         if problems:

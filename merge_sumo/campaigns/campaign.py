@@ -10,8 +10,8 @@ from typing import Any
 
 from merge_sumo.campaigns.journal import Journal
 from merge_sumo.campaigns.loop import Groups, SearchLoop
+from merge_sumo.campaigns.recorded import AGAINST, FILES, TALLIES, RecordedCampaign, spread_failures
 from merge_sumo.campaigns.repeats import repeat
-from merge_sumo.campaigns.run import AGAINST, FILES, TALLIES, Run, spread_failures
 from merge_sumo.campaigns.settings import CampaignSettings, record_of
 from merge_sumo.controllers.process import LOG
 from merge_sumo.errors import UserError, notice
@@ -30,7 +30,7 @@ from merge_sumo.scenario.case import Pool
 from merge_sumo.simulation.evaluate import open_simulators
 from merge_sumo.simulation.plan import SimulationPlan, differences
 from merge_sumo.sumo.replay_folder import write_scenario
-from merge_sumo.workers import Workers, workers_or_here
+from merge_sumo.workers import Workers, workers_or_serial
 
 EXPORTED_FAILURES = 10
 SCENARIOS = "scenarios"
@@ -48,7 +48,7 @@ def run_campaign(
     resumes: bool = False,
     workers: Workers | None = None,
     begin: Callback = lambda _: None,
-) -> Run:
+) -> RecordedCampaign:
     """Run a campaign into a new folder, or one that was stopped to its end; return it.
 
     Same settings, same versions: same `outcomes.jsonl`, whatever the workers, and as if the
@@ -81,7 +81,7 @@ def run_campaign(
     plan = plan.for_cases(settings.in_flight or batch or settings.cases)
     plan = plan.with_log(folder.resolve() / LOG)
     history: list[Episode] = []
-    with workers_or_here(workers) as available, ExitStack() as opened:
+    with workers_or_serial(workers) as available, ExitStack() as opened:
         if resumes:
             journal, history = _resumed(settings, plan, folder, opened, available)
         else:
@@ -107,9 +107,9 @@ def run_campaign(
             history=history,
         )
         loop.run(on_groups)
-        done = Run(folder)
+        done = RecordedCampaign(folder)
         if plan.earlier is not None:
-            repeat(Run(folder / AGAINST), settings.earlier, plan.earlier, available)
+            repeat(RecordedCampaign(folder / AGAINST), settings.earlier, plan.earlier, available)
         repeat(done, settings, replace(plan, against=None), available)
     for outcome in spread_failures(done.cases)[:EXPORTED_FAILURES]:
         with suppress(TakenError):  # whatever it is, the campaign has ended
@@ -136,7 +136,7 @@ def _resumed(
 ) -> tuple[Journal, list[Episode]]:
     """Return the journal of a folder, which `opened` closes, and the episodes that it has."""
     journal, before = _reopened(settings, plan, folder, opened)
-    old: Run | None = None
+    old: RecordedCampaign | None = None
     if plan.earlier is not None:
         place = folder / AGAINST
         if not before.outcomes:  # it may have been stopped before that folder was whole
@@ -156,7 +156,7 @@ def _resumed(
 
 def _reopened(
     settings: CampaignSettings, plan: SimulationPlan, folder: Path, opened: ExitStack
-) -> tuple[Journal, Run]:
+) -> tuple[Journal, RecordedCampaign]:
     """Return the journal of a folder, which `opened` closes, and the campaign in it."""
     journal, before, dropped = Journal.reopen(folder)
     opened.enter_context(journal)
@@ -166,7 +166,9 @@ def _reopened(
     return journal, before
 
 
-def _continued(settings: CampaignSettings, plan: SimulationPlan, before: Run) -> dict[str, Any]:
+def _continued(
+    settings: CampaignSettings, plan: SimulationPlan, before: RecordedCampaign
+) -> dict[str, Any]:
     """Return the record of a campaign that continues.
 
     Raises `UserError` where something differs that decides outcomes: cases of two controllers are
@@ -221,7 +223,9 @@ def case_name(index: int) -> str:
     return f"case-{index:05d}"
 
 
-def export_case(run: Run, index: int, folder: Path, road: Corridor | None = None) -> Path:
+def export_case(
+    run: RecordedCampaign, index: int, folder: Path, road: Corridor | None = None
+) -> Path:
     """Write a case of a campaign as a replay folder.
 
     Args:

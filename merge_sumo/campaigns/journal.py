@@ -1,4 +1,4 @@
-"""The writer of a campaign folder (`run.py`): one process, and whole groups of episodes.
+"""The writer of a campaign folder (`recorded.py`): one process, and whole groups of episodes.
 
 The trajectories of a group go first, so that every outcome on disk has its trajectory there.
 """
@@ -18,14 +18,14 @@ from typing import Any, Self
 import numpy as np
 
 from merge_sumo.campaigns.again import again
-from merge_sumo.campaigns.run import (
+from merge_sumo.campaigns.recorded import (
     FILES,
     IN_VAIN,
     OUTCOMES,
     RAN_AGAIN,
     SETTINGS,
     TRAJECTORIES,
-    Run,
+    RecordedCampaign,
     batch_file,
 )
 from merge_sumo.errors import UserError
@@ -79,14 +79,14 @@ class Journal:
         return cls(folder, (folder / OUTCOMES).open("r+b", buffering=0), settings)
 
     @classmethod
-    def reopen(cls, folder: Path) -> tuple[Self, Run, int]:
+    def reopen(cls, folder: Path) -> tuple[Self, RecordedCampaign, int]:
         """Return the journal of a stopped campaign, the campaign, and the number of lost outcomes.
 
         The outcomes of a batch that was not written to its end are dropped: its cases run again.
 
         Raises:
-            UserError: another process writes the folder, a link in it leads elsewhere, or `Run`
-                cannot read it.
+            UserError: another process writes the folder, a link in it leads elsewhere, or
+                `RecordedCampaign` cannot read it.
         """
         check_own(*(folder / name for name in (SETTINGS, OUTCOMES, TRAJECTORIES)))
         check_own(*(folder / TRAJECTORIES).glob("*"))
@@ -94,7 +94,7 @@ class Journal:
             try:
                 outcomes = (folder / OUTCOMES).open("r+b", buffering=0)
                 journal = cls(folder, opened.enter_context(outcomes), {})
-                run = Run(folder)
+                run = RecordedCampaign(folder)
                 journal.settings = run.record
                 whole = run.whole_batches()
                 dropped = len(run.outcomes) - whole + run.torn
@@ -105,7 +105,7 @@ class Journal:
             opened.pop_all()
         return journal, run, dropped
 
-    def keep(self, run: Run, cases: int) -> None:
+    def keep(self, run: RecordedCampaign, cases: int) -> None:
         """Drop all outcomes of a run after its first cases, from the folder and from memory."""
         del run.outcomes[cases:]
         self._outcomes.seek(0)

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from merge_sumo import config as c
-from merge_sumo.campaigns.run import Run
+from merge_sumo.campaigns.recorded import RecordedCampaign
 from merge_sumo.campaigns.settings import CampaignSettings, settings_of
 from merge_sumo.controllers.in_memory import AnyVut, drivers_of
 from merge_sumo.controllers.kinds import load
@@ -149,7 +149,7 @@ ONE: dict[str, Any] = {
 """Settings of a campaign that is one case."""
 
 
-def planned_case(config: c.RunCase, run: Run | None) -> tuple[CampaignSettings, Case]:
+def planned_case(config: c.RunCase, run: RecordedCampaign | None) -> tuple[CampaignSettings, Case]:
     """Return a case, and how it is run.
 
     The coordinates of the config win over those of its row, or of the recorded case.

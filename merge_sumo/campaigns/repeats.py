@@ -16,7 +16,7 @@ from typing import Final
 
 import numpy as np
 
-from merge_sumo.campaigns.run import Run
+from merge_sumo.campaigns.recorded import RecordedCampaign
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.controllers.kinds import is_built_in, waits_for_client
 from merge_sumo.files import replace_own
@@ -62,7 +62,7 @@ class Repeat(Record, frozen=True, forbid_unknown_fields=False):
 
 
 def repeat(
-    run: Run, settings: CampaignSettings, plan: SimulationPlan, workers: Workers
+    run: RecordedCampaign, settings: CampaignSettings, plan: SimulationPlan, workers: Workers
 ) -> list[Repeat]:
     """Run some cases of a campaign again, and write the comparison to `repeats.jsonl`.
 
@@ -150,7 +150,7 @@ def _difference(one: Trajectory, other: Trajectory) -> tuple[float | None, Vehic
     return (None if same else round((rows - 1) * DT_S, 1)), None
 
 
-def read_repeats(run: Run) -> list[Repeat]:
+def read_repeats(run: RecordedCampaign) -> list[Repeat]:
     """Read the comparisons of a campaign; `UserError` for a wrong line."""
     return read_indexed(run.folder / REPEATS, Repeat, range(len(run.outcomes)))
 

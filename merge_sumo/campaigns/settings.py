@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from merge_sumo.campaigns.again import CONTROLLERS
-from merge_sumo.campaigns.run import (
+from merge_sumo.campaigns.recorded import (
     NAME_CHARACTERS,
     SETTINGS,
     SharedSettings,

@@ -49,7 +49,7 @@ class BuiltInKind(ControllerKind):
         if built_in.ramp_only:
             self.no_pov = "that is a VUT for the ramp; the POVs of levels 0 to 2 need no name"
 
-    def driver(self, corridors: int, _world: object) -> Driver:
+    def driver(self, corridors: int, _simulation: object) -> Driver:
         """Return its driver for a number of corridors."""
         make = self._built_in.make
         if self._design is not None:

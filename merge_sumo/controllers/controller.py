@@ -11,11 +11,11 @@ import msgspec
 import numpy as np
 
 from merge_sumo.controllers.deadline import Deadline, closed, text_of
-from merge_sumo.drivers.base import MERGE, NO_WISH, STAY, Driver, Scene
-from merge_sumo.drivers.following import car_met
+from merge_sumo.drivers.base import MERGE, NO_REQUEST, STAY, Driver, Scene
+from merge_sumo.drivers.following import conflicting_car
 from merge_sumo.scenario.case import Case, FloatArray
 from merge_sumo.scenario.scenario import DT_S, POV, VUT, Bounds
-from merge_sumo.scenario.signals import Left
+from merge_sumo.scenario.signals import StepSignals
 
 
 class Car(NamedTuple):
@@ -45,7 +45,7 @@ class Seen(_State):
 
     In traffic the conflicting car counts as POV: the one that would be nearest to M when the VUT is
     there, if the car kept its speed and the VUT drove the scenario's level-0 profile
-    (`drivers.following.car_met`). `others` has all cars.
+    (`drivers.following.conflicting_car`). `others` has all cars.
 
     On a road with an acceleration lane the lane begins at `lane_begin_m` and ends at `lane_end_m`;
     M is where a merge is expected. Elsewhere both are 0, and the VUT merges at M.
@@ -109,7 +109,7 @@ class Seen(_State):
 
 def seen_in(
     t_s: float,
-    facing: int,
+    conflicting: int,
     x_m: Sequence[float],
     v_mps: Sequence[float],
     lane_m: Bounds | None = None,
@@ -120,13 +120,13 @@ def seen_in(
 
     Args:
         t_s: time since the episode began.
-        facing: row of the car that counts as POV.
+        conflicting: row of the car that counts as POV.
         x_m: positions by row.
         v_mps: speeds by row.
         lane_m: acceleration lane, None without one.
         merged: whether the VUT has left that lane.
     """
-    seen = Seen(t_s, x_m[facing], v_mps[facing], x_m[VUT], v_mps[VUT])
+    seen = Seen(t_s, x_m[conflicting], v_mps[conflicting], x_m[VUT], v_mps[VUT])
     if lane_m is not None:
         seen._lane_m, seen._merged = lane_m, merged
     if len(x_m) > 2:
@@ -142,7 +142,7 @@ class Start(msgspec.Struct, array_like=True, frozen=True):
         a_min_mps2: least acceleration of the scenario.
         a_max_mps2: largest acceleration of the scenario.
         lane_m: acceleration lane, None without one.
-        facing: row of the car that counts as POV.
+        conflicting: row of the car that counts as POV.
         x_m: positions by row.
         v_mps: speeds by row.
     """
@@ -151,7 +151,7 @@ class Start(msgspec.Struct, array_like=True, frozen=True):
     a_min_mps2: float
     a_max_mps2: float
     lane_m: tuple[float, float] | None
-    facing: int
+    conflicting: int
     x_m: tuple[float, ...]
     v_mps: tuple[float, ...]
 
@@ -160,15 +160,15 @@ class Start(msgspec.Struct, array_like=True, frozen=True):
         """Return the start of a case."""
         scenario = case.scenario
         x_m, v_mps = np.array(case.starts(), dtype=np.float64).T
-        facing = POV
+        conflicting = POV
         if len(x_m) > 2:
-            facing = int(car_met(x_m[:, None], v_mps[:, None], scenario)[0])
+            conflicting = int(conflicting_car(x_m[:, None], v_mps[:, None], scenario)[0])
         return cls(
-            seed=case.told_seed,
+            seed=case.controller_seed,
             a_min_mps2=float(scenario.a_min_mps2),
             a_max_mps2=float(scenario.a_max_mps2),
             lane_m=scenario.lane_m,
-            facing=facing,
+            conflicting=conflicting,
             x_m=tuple(x_m.tolist()),
             v_mps=tuple(v_mps.tolist()),
         )
@@ -176,7 +176,7 @@ class Start(msgspec.Struct, array_like=True, frozen=True):
     @property
     def seen(self) -> Seen:
         """The controller's observation at the start."""
-        return seen_in(0.0, self.facing, self.x_m, self.v_mps, self.lane_m)
+        return seen_in(0.0, self.conflicting, self.x_m, self.v_mps, self.lane_m)
 
 
 class Controller:
@@ -202,7 +202,7 @@ class Controller:
         """Return the acceleration for the next step, m/s2, or (acceleration, whether to merge)."""
         raise NotImplementedError
 
-    def signals(self) -> Left:
+    def signals(self) -> StepSignals:
         """Return the signals of the last answer."""
         return {}
 
@@ -246,7 +246,7 @@ class ControllerArray(ControllerDriver):
         self._controllers: list[Controller] = []
         self._reasons: list[str | None] = [None] * corridors
         self._replace = [False] * corridors
-        self._signals: dict[int, Left] = {}
+        self._signals: dict[int, StepSignals] = {}
         self._lanes_m: list[Bounds | None] = [None] * corridors
         try:
             for _ in range(corridors):
@@ -276,11 +276,13 @@ class ControllerArray(ControllerDriver):
     def act(self, scene: Scene) -> FloatArray:
         """Return the answers of the controllers; NaN where there is a reason."""
         self._signals = {}
-        answers, wishes = [0.0] * self.corridors, [NO_WISH] * self.corridors
-        facing = [POV] * self.corridors if scene.facing is None else scene.facing.tolist()
+        answers, merge_requests = [0.0] * self.corridors, [NO_REQUEST] * self.corridors
+        conflicting = [POV] * self.corridors
+        if scene.conflicting is not None:
+            conflicting = scene.conflicting.tolist()
         merged = [False] * self.corridors if scene.merged is None else scene.merged.tolist()
         columns = scene.active, scene.step, scene.x_m.T, scene.v_mps.T
-        rows = zip(*(column.tolist() for column in columns), facing, merged, strict=True)
+        rows = zip(*(column.tolist() for column in columns), conflicting, merged, strict=True)
         with self._deadline as deadline:
             for k, (active, step, x_m, v_mps, row, has_merged) in enumerate(rows):
                 if not active:
@@ -295,20 +297,20 @@ class ControllerArray(ControllerDriver):
                     answer = as_answer(controller.act(seen))
                     signals = controller.signals()
                     deadline.stop()
-                    answers[k], wishes[k] = answer
+                    answers[k], merge_requests[k] = answer
                     if signals:
                         self._signals[k] = signals
                 except BaseException as error:
                     self._fail(k, deadline.reason(error))
-        chooses = wishes.count(NO_WISH) < self.corridors
-        self._wishes = np.array(wishes, dtype=np.int8) if chooses else None
+        chooses = merge_requests.count(NO_REQUEST) < self.corridors
+        self._merge_requests = np.array(merge_requests, dtype=np.int8) if chooses else None
         return np.array(answers)
 
     def reason(self, corridor: int) -> str | None:
         """Return the error of the controller of a corridor."""
         return self._reasons[corridor]
 
-    def signals(self) -> Mapping[int, Left]:
+    def signals(self) -> Mapping[int, StepSignals]:
         """Return the signals of the last answers, by corridor."""
         return self._signals
 
@@ -333,29 +335,29 @@ class WrongAnswerError(Exception):
 
 
 def as_answer(answer: Any) -> tuple[float, int]:
-    """Return an answer as an acceleration and a merge request, `NO_WISH` where it has none.
+    """Return an answer as an acceleration and a merge request, `NO_REQUEST` where it has none.
 
     Raises `WrongAnswerError` unless it is one real number or (number, whether to merge).
     """
     if type(answer) is float:
-        return answer, NO_WISH
-    acceleration, wish = answer, NO_WISH
+        return answer, NO_REQUEST
+    acceleration, request = answer, NO_REQUEST
     if isinstance(answer, tuple | list) and len(answer) == 2:
         acceleration, merge = answer
-        wish = _as_wish(merge)
+        request = _as_merge_request(merge)
     number = np.asarray(acceleration)
     if number.shape != () or number.dtype.kind not in "fiu":
         shown = _shown(acceleration)
         raise WrongAnswerError(f"answered {shown} instead of a number, or (number, merge)")
-    return float(number), wish
+    return float(number), request
 
 
-def _as_wish(merge: Any) -> int:
-    wish = np.asarray(merge)
-    if wish.shape != () or wish.dtype.kind not in "bfiu" or wish not in (0, 1):
+def _as_merge_request(merge: Any) -> int:
+    request = np.asarray(merge)
+    if request.shape != () or request.dtype.kind not in "bfiu" or request not in (0, 1):
         shown = _shown(merge)
-        raise WrongAnswerError(f"wishes {shown} instead of True or False, to merge or not")
-    return MERGE if wish else STAY
+        raise WrongAnswerError(f"requests {shown} instead of True or False, to merge or not")
+    return MERGE if request else STAY
 
 
 MERGES_ABOVE = 0.5
@@ -365,7 +367,7 @@ MERGES_ABOVE = 0.5
 def as_merge(number: float) -> bool:
     """Return whether an output is a merge request; `WrongAnswerError` for NaN and infinity."""
     if not math.isfinite(number):
-        raise WrongAnswerError(f"wishes {number} instead of a number, to merge or not")
+        raise WrongAnswerError(f"requests {number} instead of a number, to merge or not")
     return number > MERGES_ABOVE
 
 

@@ -37,7 +37,7 @@ class FmuKind(FileKind):
         inputs: index in the state and variable of each input.
         output: variable of the acceleration, or of the speed reached.
         reaches: whether the output is the speed reached.
-        wish: variable of the merge request, if there is one.
+        merge_request: variable of the merge request, if there is one.
         seed: variable of the seed, if there is one.
     """
 
@@ -79,7 +79,7 @@ class FmuKind(FileKind):
         if self.output is None:
             self.chosen.setdefault(OUTPUT, OUTPUT)  # it must be there
             self.output = self._variable(OUTPUT, "output")
-        self.wish = self._variable(MERGE, "output", (*FLOATS, "Boolean"))
+        self.merge_request = self._variable(MERGE, "output", (*FLOATS, "Boolean"))
         self.seed = self._variable(SEED, "input parameter", (*FLOATS, *INTEGERS))
 
     def controller(self) -> Controller:
@@ -174,9 +174,9 @@ class FmuController(Controller):
         acceleration_mps2 = self._value(unit.output)
         if unit.reaches:
             acceleration_mps2 = (acceleration_mps2 - seen.v_vut_mps) / DT_S
-        if unit.wish is None:
+        if unit.merge_request is None:
             return acceleration_mps2
-        return acceleration_mps2, as_merge(self._value(unit.wish))
+        return acceleration_mps2, as_merge(self._value(unit.merge_request))
 
     def close(self) -> None:
         """Free the instance."""

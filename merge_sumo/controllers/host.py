@@ -23,9 +23,9 @@ from merge_sumo.controllers.controller import ControllerDriver, Start
 from merge_sumo.controllers.deadline import heartbeat, text_of
 from merge_sumo.controllers.process import connected
 from merge_sumo.controllers.spec import ControllerKind, ControllerOptions, ControllerSpec
-from merge_sumo.drivers.base import Scene, VutLostError
+from merge_sumo.drivers.base import ControllerDiedError, Scene
 from merge_sumo.errors import ControllerError, UserError
-from merge_sumo.scenario.signals import Left
+from merge_sumo.scenario.signals import StepSignals
 from merge_sumo.spawning import named
 
 ALIVE_S = 0.25
@@ -63,7 +63,7 @@ class HostReply(msgspec.Struct, omit_defaults=True):
         files: files of code that were loaded, where they may be others than before.
         parameters: those of the controllers that were made.
         accelerations_mps2: answers of the drivers, (K,).
-        wishes: their merge requests, (K,).
+        merge_requests: their merge requests, (K,).
         reasons: the errors of answers, by corridor.
         signals: signals of the answers, by corridor.
     """
@@ -74,9 +74,9 @@ class HostReply(msgspec.Struct, omit_defaults=True):
     files: list[bytes] = []
     parameters: dict[str, float] = {}
     accelerations_mps2: list[float] = []
-    wishes: list[Literal[-1, 0, 1]] | None = None
+    merge_requests: list[Literal[-1, 0, 1]] | None = None
     reasons: dict[int, str] = {}
-    signals: dict[int, Left] = {}
+    signals: dict[int, StepSignals] = {}
 
 
 encode = msgspec.msgpack.Encoder(enc_hook=np.ndarray.tolist).encode
@@ -124,7 +124,7 @@ class _Host:
         process = os.getpid()
         try:
             reply = action(request)
-        except (UserError, VutLostError) as error:
+        except (UserError, ControllerDiedError) as error:
             # Names of files may not be valid text.
             text = str(error).encode(errors="backslashreplace").decode()
             reply = HostReply(failed=text, is_finding=isinstance(error, ControllerError))
@@ -153,14 +153,14 @@ class _Host:
         assert scene is not None, "of each such request"  # noqa: S101
         for corridor, start in request.starts:
             driver.reset(corridor, start)
-        answers, wishes = driver.act(scene), driver.wishes()
+        answers, merge_requests = driver.act(scene), driver.merge_requests()
         reasons = {}
         for corridor in np.flatnonzero(~np.isfinite(answers) & scene.active).tolist():
             if (reason := driver.reason(corridor)) is not None:
                 reasons[corridor] = reason
         return HostReply(
             accelerations_mps2=answers.tolist(),
-            wishes=None if wishes is None else wishes.tolist(),
+            merge_requests=None if merge_requests is None else merge_requests.tolist(),
             reasons=reasons,
             signals=dict(driver.signals()),
             files=self._files(),

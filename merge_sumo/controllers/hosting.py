@@ -20,11 +20,11 @@ from merge_sumo.controllers.controller import ControllerDriver, Start
 from merge_sumo.controllers.host import HostReply, HostRequest, decode_reply, encode
 from merge_sumo.controllers.process import BROKEN, ChildProcess, ProcessDiedError
 from merge_sumo.controllers.spec import ControllerKind, ControllerOptions, ControllerSpec
-from merge_sumo.drivers.base import Driver, Scene, VutLostError
+from merge_sumo.drivers.base import ControllerDiedError, Driver, Scene
 from merge_sumo.errors import ControllerError, UserError
 from merge_sumo.files import ScratchFolder
 from merge_sumo.scenario.case import FloatArray
-from merge_sumo.scenario.signals import Left, as_signals
+from merge_sumo.scenario.signals import StepSignals, as_signals
 
 SUPPORTED = os.name == "posix"
 """Elsewhere a controller runs in this process."""
@@ -168,7 +168,7 @@ class HostedKind(ControllerKind):
             other._process.output.log = options.log
         return other
 
-    def driver(self, corridors: int, _world: object) -> Driver:
+    def driver(self, corridors: int, _simulation: object) -> Driver:
         """Return a driver that asks the process."""
         return HostedDriver(corridors, self)
 
@@ -215,7 +215,7 @@ class HostedDriver(ControllerDriver):
     def act(self, scene: Scene) -> FloatArray:
         """Return the answers of the controllers; NaN where there is a reason.
 
-        Raises `VutLostError` where the process died.
+        Raises `ControllerDiedError` where the process died.
         """
         request = HostRequest("act", starts=self._starts, scene=scene)
         self._starts = []
@@ -229,18 +229,24 @@ class HostedDriver(ControllerDriver):
         try:
             self._reply = reply = self._process.request(request)
         except (ProcessDiedError, UserError) as error:
-            raise VutLostError(str(error)) from None
+            raise ControllerDiedError(str(error)) from None
         self._files.update(paths_of(reply))
-        answers, wishes = np.array(reply.accelerations_mps2), reply.wishes
-        self._wishes = None if wishes is None else np.array(wishes, dtype=np.int8)
-        if not len(answers) == self.corridors == len(answers if wishes is None else wishes):
+        answers, merge_requests = np.array(reply.accelerations_mps2), reply.merge_requests
+        self._merge_requests = (
+            None if merge_requests is None else np.array(merge_requests, dtype=np.int8)
+        )
+        if (
+            not len(answers)
+            == self.corridors
+            == len(answers if merge_requests is None else merge_requests)
+        ):
             self._process.kill()
-            raise VutLostError(BROKEN)
+            raise ControllerDiedError(BROKEN)
         return answers
 
-    def signals(self) -> Mapping[int, Left]:
+    def signals(self) -> Mapping[int, StepSignals]:
         """Return the signals of the last answers, by corridor."""
-        signals: dict[int, Left] = {}
+        signals: dict[int, StepSignals] = {}
         for corridor, left in self._reply.signals.items():
             signals[corridor] = as_signals(left)
         return signals

@@ -12,7 +12,7 @@ from typing import Any, Protocol, SupportsFloat
 
 from merge_sumo.controllers.controller import Seen
 from merge_sumo.controllers.kinds import parse, runs_code
-from merge_sumo.controllers.python import HereKind, SeenBatch, object_of, objects
+from merge_sumo.controllers.python import InProcessKind, SeenBatch, object_of, objects
 from merge_sumo.controllers.signatures import is_code
 from merge_sumo.controllers.spec import HERE, ControllerOptions, ControllerSpec
 from merge_sumo.errors import UserError, notice
@@ -60,14 +60,14 @@ def spec_of(vut: Any) -> str:
     spec = ControllerSpec(HERE, unique)
     objects[unique] = vut
     try:
-        HereKind(spec, ControllerOptions())
+        InProcessKind(spec, ControllerOptions())
     except UserError:
         del objects[unique]
         raise
     return str(spec)
 
 
-def is_here(text: str) -> bool:
+def is_in_process(text: str) -> bool:
     """Return whether a spec names an object of this process."""
     return parse(text).kind == HERE
 

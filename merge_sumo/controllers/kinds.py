@@ -28,7 +28,7 @@ KINDS: Registry[type[ControllerKind]] = Registry(
         "sumo": "merge_sumo.controllers.sumo_model:SumoKind",
         "onnx": "merge_sumo.controllers.onnx:OnnxKind",
         "fmu": "merge_sumo.controllers.fmu:FmuKind",
-        HERE: "merge_sumo.controllers.python:HereKind",
+        HERE: "merge_sumo.controllers.python:InProcessKind",
         INSTALLED: "merge_sumo.controllers.python:InstalledKind",
         BUILT_IN: "merge_sumo.controllers.built_in:BuiltInKind",
     },

@@ -37,13 +37,13 @@ from merge_sumo.controllers.signatures import (
     takes_seed,
 )
 from merge_sumo.controllers.spec import HERE, ControllerKind, ControllerOptions, ControllerSpec
-from merge_sumo.drivers.base import MERGE, NO_WISH, STAY, Driver, Scene, VutLostError
+from merge_sumo.drivers.base import MERGE, NO_REQUEST, STAY, ControllerDiedError, Driver, Scene
 from merge_sumo.errors import ControllerError, UserError
 from merge_sumo.files import check_code
 from merge_sumo.registry import entries_of
 from merge_sumo.scenario.case import FloatArray
 from merge_sumo.scenario.scenario import DT_S, VUT
-from merge_sumo.scenario.signals import Left, as_signals
+from merge_sumo.scenario.signals import StepSignals, as_signals
 
 objects: dict[str, Any] = {}
 """The objects of this process that are controllers, by the arguments of their specs."""
@@ -118,11 +118,11 @@ class OfPython(ControllerKind):
         """Return a controller of one corridor."""
         return PythonController(self)
 
-    def driver(self, corridors: int, world: object) -> Driver:
+    def driver(self, corridors: int, simulation: object) -> Driver:
         """Return the driver of all corridors."""
         if self._is_batched:
             return BatchedVut(corridors, self)
-        return super().driver(corridors, world)
+        return super().driver(corridors, simulation)
 
     def make(self, *corridors: int) -> Any:
         """Return a new object, made with the number of corridors where it acts in all of them."""
@@ -194,7 +194,7 @@ class InstalledKind(PythonKind):
         return self.code_at(f"{entry.module}:{entry.attr}")
 
 
-class HereKind(OfPython):
+class InProcessKind(OfPython):
     """An object of this process, `here:NAME`, which drives in it."""
 
     files_are_known, max_workers = False, 1
@@ -233,7 +233,7 @@ class PythonController(Controller):
         """Call `reset`, if there is one."""
         _reset(self._thing, start.seen, seed=start.seed)
 
-    def signals(self) -> Left:
+    def signals(self) -> StepSignals:
         """Return the `signals` that the object has left as an attribute."""
         left = getattr(self._thing, "signals", None)
         return {} if left is None else as_signals(left)
@@ -285,9 +285,10 @@ class BatchedVut(ControllerDriver):
     def act(self, scene: Scene) -> FloatArray:
         """Call `act_batch` on a copy of the scene.
 
-        Raises `VutLostError` when it fails and several episodes run: the one at fault is unknown.
+        Raises:
+            ControllerDiedError: it fails and several episodes run, so the one at fault is unknown.
         """
-        self._wishes, k = None, self.corridors
+        self._merge_requests, k = None, self.corridors
         seen = _batch(scene, self._lanes_m)
         try:
             with self._deadline as deadline:
@@ -297,13 +298,13 @@ class BatchedVut(ControllerDriver):
             if answer.shape not in ((k,), (2, k)) or answer.dtype.kind not in "fiu":
                 raise WrongAnswerError(
                     f"answered shape {answer.shape} of {answer.dtype} instead of {k} numbers, or "
-                    f"these and {k} wishes"
+                    f"these and {k} merge requests"
                 )
         except BaseException as error:
             reason, self._replace = self._deadline.reason(error), True
             running = np.flatnonzero(scene.active).tolist()
             if len(running) > 1:
-                raise VutLostError(reason) from None
+                raise ControllerDiedError(reason) from None
             self._errors = dict.fromkeys(running, reason) | self._errors
             return np.full(k, np.nan)
         answer = answer.astype(np.float64)
@@ -316,9 +317,11 @@ class BatchedVut(ControllerDriver):
     def _take(self, requests: FloatArray, active: NDArray[np.bool_]) -> None:
         """Take whether to merge, 1 or 0, (K,), where an episode runs."""
         known = (requests == MERGE) | (requests == STAY)
-        self._wishes = np.where(active & known, requests == MERGE, NO_WISH).astype(np.int8)
+        self._merge_requests = np.where(active & known, requests == MERGE, NO_REQUEST).astype(
+            np.int8
+        )
         for corridor in np.flatnonzero(active & ~known).tolist():
-            wrong = f"wishes {requests[corridor]} instead of 1 or 0, to merge or not"
+            wrong = f"requests {requests[corridor]} instead of 1 or 0, to merge or not"
             self._errors.setdefault(corridor, wrong)
 
     def parameters(self) -> Mapping[str, float]:

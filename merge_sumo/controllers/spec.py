@@ -158,8 +158,8 @@ class ControllerKind:
         """Return a new controller of one corridor."""
         raise NotImplementedError
 
-    def driver(self, corridors: int, _world: object) -> Driver:
-        """Return a driver for a number of corridors in a world of SUMO; None for no world."""
+    def driver(self, corridors: int, _simulation: object) -> Driver:
+        """Return a driver for a number of corridors in a simulation of SUMO, or in none (None)."""
         return ControllerArray(corridors, self.controller, self.options.deadline_s)
 
     def release(self) -> None:
@@ -197,12 +197,12 @@ class ControllerKind:
     def __hash__(self) -> int:
         return hash(self.spec)
 
-    def open(self, corridors: int, world: object = None) -> Driver:
+    def open(self, corridors: int, simulation: object = None) -> Driver:
         """Return a driver.
 
         Args:
             corridors: number of corridors.
-            world: the world of SUMO in which it drives, if there is one.
+            simulation: the simulation of SUMO in which it drives, if there is one.
 
         Raises:
             UserError: if the code of the controller has changed since it was loaded first.
@@ -213,7 +213,7 @@ class ControllerKind:
                     f"{printable(name)}, code of the VUT {self.spec}, is not as it was when this "
                     "began: let it be while it runs, and let all workers have the same"
                 )
-        return self.driver(corridors, world)
+        return self.driver(corridors, simulation)
 
     def workers(self, requested: int | None) -> int:
         """Return in how many processes it is tested: the requested ones, or one a core for None.

@@ -4,7 +4,7 @@ At every step the model decides on a speed from the state, as it does in any SUM
 POV is a vehicle on the road for it, before M by the right of way of the zipper junction and after M
 as a leader. That speed is the VUT's answer: the acceleration to it is clipped and counted like
 any other, and eq. (4) moves the car. On an acceleration lane SUMO's lane-change model decides when
-to merge: the lane on which the VUT is after SUMO's step is its wish.
+to merge: the lane on which the VUT is after SUMO's step is its merge request.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from merge_sumo.drivers.lane import END_MARGIN_M, stopping_mps
 from merge_sumo.errors import UserError
 from merge_sumo.scenario.case import FloatArray
 from merge_sumo.scenario.scenario import DT_S, VUT
-from merge_sumo.sumo.world import World
+from merge_sumo.sumo.sumo_simulation import SumoSimulation
 
 SHARED_OPTIONS = (
     "maxSpeed accel decel emergencyDecel apparentDecel tau minGap speedFactor impatience "
@@ -86,38 +86,40 @@ class SumoKind(ControllerKind):
         for name, value in (NO_NOISE.get(model, {}) | chosen).items():
             self.vut_type[name] = f"{value:.12g}"
 
-    def driver(self, corridors: int, world: object) -> Driver:
-        """Return a driver in a world of SUMO."""
-        if not isinstance(world, World):
-            raise UserError(f"{self.spec} drives in a SUMO world only")
-        return SumoVut(corridors, world)
+    def driver(self, corridors: int, simulation: object) -> Driver:
+        """Return a driver in a simulation of SUMO."""
+        if not isinstance(simulation, SumoSimulation):
+            raise UserError(f"{self.spec} drives in a SUMO simulation only")
+        return SumoVut(corridors, simulation)
 
 
 class SumoVut(Driver):
     """Answers the accelerations on which SUMO decided in its step."""
 
-    def __init__(self, corridors: int, world: World, rows: Sequence[int] = (VUT,)) -> None:
-        """Drive the vehicles in rows of a world that was opened with a vType for them.
+    def __init__(
+        self, corridors: int, simulation: SumoSimulation, rows: Sequence[int] = (VUT,)
+    ) -> None:
+        """Drive the vehicles in rows of a simulation that was opened with a vType for them.
 
         These are the VUTs, or the cars of the mainline: then `corridors` are those of all cars.
         """
         super().__init__(corridors)
-        self.world, self._rows = world, list(rows)
-        self._chooses = world.road.lane_m is not None and self._rows == [VUT]
-        self._merges = np.zeros(world.corridors, dtype=np.bool_)
+        self.simulation, self._rows = simulation, list(rows)
+        self._chooses = simulation.road.lane_m is not None and self._rows == [VUT]
+        self._merges = np.zeros(simulation.corridors, dtype=np.bool_)
 
     def act(self, scene: Scene) -> FloatArray:
         """Return the accelerations to the speeds that SUMO decided on."""
-        v_mps = self.world.v_mps[self._rows].ravel()
-        wanted_mps = self.world.wanted_v_mps(self._rows)
+        v_mps = self.simulation.v_mps[self._rows].ravel()
+        wanted_mps = self.simulation.wanted_v_mps(self._rows)
         if self._chooses:
-            self._merges = self.world.wants_to_merge()
+            self._merges = self.simulation.requests_merge()
             stays = ~self._merges if scene.merged is None else ~(self._merges | scene.merged)
             wanted_mps = np.where(stays, np.minimum(wanted_mps, self._stopping_mps()), wanted_mps)
         acceleration: FloatArray = (wanted_mps - v_mps) / DT_S
         return acceleration
 
-    def wishes(self) -> NDArray[np.int8] | None:
+    def merge_requests(self) -> NDArray[np.int8] | None:
         """Return whether SUMO's lane-change model merged, (K,); None without a lane."""
         return np.where(self._merges, MERGE, STAY).astype(np.int8) if self._chooses else None
 
@@ -127,6 +129,6 @@ class SumoVut(Driver):
         In a step SUMO moves by the new speed and eq. (4) by the old one, so a driver that brakes at
         the last moment would come a little beyond the end.
         """
-        _, end_m = self.world.road.lane_m or (0.0, 0.0)
-        next_m = self.world.x_m[VUT] + self.world.v_mps[VUT] * DT_S
-        return stopping_mps(end_m - END_MARGIN_M - next_m, -self.world.scenario.a_min_mps2)
+        _, end_m = self.simulation.road.lane_m or (0.0, 0.0)
+        next_m = self.simulation.x_m[VUT] + self.simulation.v_mps[VUT] * DT_S
+        return stopping_mps(end_m - END_MARGIN_M - next_m, -self.simulation.scenario.a_min_mps2)

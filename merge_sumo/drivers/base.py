@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from merge_sumo.errors import UserError
 from merge_sumo.scenario.case import Case, FloatArray
 from merge_sumo.scenario.scenario import POV, US23, VUT, Scenario
-from merge_sumo.scenario.signals import Left
+from merge_sumo.scenario.signals import StepSignals
 
 
 class Scene(NamedTuple):
@@ -26,28 +26,28 @@ class Scene(NamedTuple):
         step: steps since the episode of the corridor began, (K,).
         x_m: distances of the front bumpers to M along their lanes, (A, K), negative before M.
         v_mps: speeds, (A, K).
-        facing: row of the car that a driver of two-car games takes for the POV, (K,); None for
+        conflicting: row of the car that a driver of two-car games takes for the POV, (K,); None for
             the POV itself everywhere.
-        merged: whether the VUT is on the mainline, (K,); None without an acceleration lane, where
-            it is there from M on.
+        merged: whether the VUT is on the mainline, from M on or since its merge from an
+            acceleration lane, (K,); None where episodes end at M.
     """
 
     active: NDArray[np.bool_]
     step: NDArray[np.int64]
     x_m: FloatArray
     v_mps: FloatArray
-    facing: NDArray[np.int64] | None = None
+    conflicting: NDArray[np.int64] | None = None
     merged: NDArray[np.bool_] | None = None
 
     @property
     def x_pov_m(self) -> FloatArray:
         """Positions of the POV, (K,), or of the car that counts as POV."""
-        return self._facing_of(self.x_m)
+        return self._of_conflicting(self.x_m)
 
     @property
     def v_pov_mps(self) -> FloatArray:
         """Speeds of the same, (K,)."""
-        return self._facing_of(self.v_mps)
+        return self._of_conflicting(self.v_mps)
 
     @property
     def x_vut_m(self) -> FloatArray:
@@ -59,10 +59,10 @@ class Scene(NamedTuple):
         """Speeds of the VUT, (K,)."""
         return np.asarray(self.v_mps[VUT])
 
-    def _facing_of(self, values: FloatArray) -> FloatArray:
-        if self.facing is None:
+    def _of_conflicting(self, values: FloatArray) -> FloatArray:
+        if self.conflicting is None:
             return np.asarray(values[POV])
-        return values[self.facing, np.arange(values.shape[1])]
+        return values[self.conflicting, np.arange(values.shape[1])]
 
     def of_mainline(self) -> Scene:
         """Return the scene for the driver of all C cars of the mainline.
@@ -83,15 +83,15 @@ class Scene(NamedTuple):
         return Scene(active, step, x_m, v_mps, merged=merged)
 
 
-class VutLostError(Exception):
+class ControllerDiedError(Exception):
     """A driver has lost the state of its corridors: their episodes have to begin again."""
 
 
-class PovLostError(VutLostError):
+class PovDiedError(ControllerDiedError):
     """The driver of the POV has lost the state of its corridors."""
 
 
-NO_WISH, STAY, MERGE = -1, 0, 1
+NO_REQUEST, STAY, MERGE = -1, 0, 1
 """Merge requests of a VUT on an acceleration lane. Without a request it merges at M."""
 
 
@@ -108,7 +108,7 @@ class Driver(ABC):
     """
 
     scenario: Scenario = US23
-    _wishes: NDArray[np.int8] | None = None
+    _merge_requests: NDArray[np.int8] | None = None
 
     def __init__(self, corridors: int) -> None:
         """Prepare for corridors 0 to `corridors` - 1."""
@@ -132,13 +132,13 @@ class Driver(ABC):
         """Return the reason why the last answer for a corridor was not finite, if it is known."""
         return None
 
-    def wishes(self) -> NDArray[np.int8] | None:
+    def merge_requests(self) -> NDArray[np.int8] | None:
         """Return the merge requests of the last answers, (K,), or None without any.
 
-        Each is `NO_WISH`, `STAY` or `MERGE`. A request is granted in the next step, if the VUT has
-        reached the acceleration lane.
+        Each is `NO_REQUEST`, `STAY` or `MERGE`. A request is granted in the next step, if the VUT
+        has reached the acceleration lane.
         """
-        return self._wishes
+        return self._merge_requests
 
     def clipped(self) -> NDArray[np.bool_] | None:
         """Return which of the last answers follow from commands outside the limits, (K,).
@@ -151,7 +151,7 @@ class Driver(ABC):
         """Return the numbers that a spec may set as `?NAME=VALUE`, with their present values."""
         return {}
 
-    def signals(self) -> Mapping[int, Left]:
+    def signals(self) -> Mapping[int, StepSignals]:
         """Return the signals of the last answers by corridor."""
         return {}
 
@@ -216,15 +216,15 @@ class DriverWrapper(Driver):
         """Return the reason of the driver."""
         return self._driver.reason(corridor)
 
-    def wishes(self) -> NDArray[np.int8] | None:
+    def merge_requests(self) -> NDArray[np.int8] | None:
         """Return the merge requests of the driver, (K,)."""
-        return self._driver.wishes()
+        return self._driver.merge_requests()
 
     def clipped(self) -> NDArray[np.bool_] | None:
         """Return which of the commands of the driver were outside the limits, or None."""
         return self._driver.clipped()
 
-    def signals(self) -> Mapping[int, Left]:
+    def signals(self) -> Mapping[int, StepSignals]:
         """Return the signals of the driver."""
         return self._driver.signals()
 

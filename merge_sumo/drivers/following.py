@@ -53,7 +53,7 @@ def keep_safe(a_mps2: FloatArray, x_m: FloatArray, v_mps: FloatArray, scenario: 
     a_mps2[FOLLOWERS] = np.minimum(a_mps2[FOLLOWERS], most)
 
 
-def car_met(x_m: FloatArray, v_mps: FloatArray, scenario: Scenario) -> NDArray[np.int64]:
+def conflicting_car(x_m: FloatArray, v_mps: FloatArray, scenario: Scenario) -> NDArray[np.int64]:
     """Return the row of the conflicting car, (K,).
 
     It is nearest to M when the VUT is there, if all cars keep their speeds and the VUT follows the

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from merge_sumo.drivers.base import MERGE, NO_WISH, STAY, BuiltInVut, Design, Scene
+from merge_sumo.drivers.base import MERGE, NO_REQUEST, STAY, BuiltInVut, Design, Scene
 from merge_sumo.drivers.lane import acc_mps2, car_ahead, stopping_mps
 from merge_sumo.drivers.level0 import Level0Vut
 from merge_sumo.errors import UserError
@@ -67,14 +67,14 @@ class GapChoiceVut(Level0Vut):
         """Return the acceleration in each corridor, (K,), and make the merge requests."""
         answer = super().act(scene)
         if self.scenario.lane_m is None or scene.merged is None:
-            self._wishes = np.full(self.corridors, NO_WISH, dtype=np.int8)
+            self._merge_requests = np.full(self.corridors, NO_REQUEST, dtype=np.int8)
             return answer
         begin_m, end_m = self.scenario.lane_m
         on_lane = ~scene.merged
         next_m = scene.x_m + scene.v_mps * DT_S
         merges = on_lane & (next_m[VUT] >= begin_m) & self._accepts(next_m, scene.v_mps)
         stays = on_lane & ~merges
-        self._wishes = np.select([merges, stays], [MERGE, STAY], NO_WISH).astype(np.int8)
+        self._merge_requests = np.select([merges, stays], [MERGE, STAY], NO_REQUEST).astype(np.int8)
         stopping = stopping_mps(end_m - END_MARGIN_M - next_m[VUT], self.choice.brake_mps2)
         slower = np.minimum(answer, (stopping - scene.v_vut_mps) / DT_S)
         follows = np.minimum(answer, self._following_mps2(scene))

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from merge_sumo.drivers.base import MERGE, NO_WISH, Driver, DriverWrapper, Scene
+from merge_sumo.drivers.base import MERGE, NO_REQUEST, Driver, DriverWrapper, Scene
 from merge_sumo.scenario.case import Case, FloatArray
 from merge_sumo.scenario.scenario import DT_S, OWN, VUT, Scenario
 
@@ -119,7 +119,7 @@ def stopping_mps(room_m: FloatArray, brake_mps2: float) -> FloatArray:
     return np.sqrt(half**2 + 2.0 * brake_mps2 * np.maximum(room_m, 0.0)) - half
 
 
-class LanePov(DriverWrapper):
+class PovAfterMerge(DriverWrapper):
     """Drives cars of the mainline at an acceleration lane by a driver that expects a merge at M.
 
     While the VUT is before M, the driver decides. When the VUT is past M, the driver sees the end
@@ -178,22 +178,24 @@ class Merging:
         self._stops = scenario.lane_end == "stop"
         self._scenario = scenario
         self.merged = np.zeros(corridors, dtype=np.bool_)
-        self._states_wishes = np.zeros(corridors, dtype=np.bool_)
+        self._states_requests = np.zeros(corridors, dtype=np.bool_)
         """Whether the VUT has ever made a merge request."""
-        self._wishes = np.zeros(corridors, dtype=np.bool_)
+        self._merge_requests = np.zeros(corridors, dtype=np.bool_)
 
     @property
     def driven_for(self) -> NDArray[np.bool_]:
         """Which VUTs have merged without any merge request, (K,): they are driven for."""
-        return self.merged & ~self._states_wishes
+        return self.merged & ~self._states_requests
 
     def begin(self, corridor: int) -> None:
         """Begin an episode in a corridor: the VUT is on the ramp."""
-        self.merged[corridor] = self._states_wishes[corridor] = self._wishes[corridor] = False
+        self.merged[corridor] = self._states_requests[corridor] = self._merge_requests[corridor] = (
+            False
+        )
 
     def take(
         self,
-        wishes: NDArray[np.int8] | None,
+        merge_requests: NDArray[np.int8] | None,
         answer: FloatArray,
         x_m: FloatArray,
         v_mps: FloatArray,
@@ -201,16 +203,18 @@ class Merging:
         """Take the merge requests of the VUTs, and limit their answers in place.
 
         Args:
-            wishes: requests of the last answers, (K,); None for a VUT that only accelerates.
+            merge_requests: those of the last answers, (K,); None for a VUT that only accelerates.
             answer: accelerations of all vehicles, (A, K).
             x_m: their positions, (A, K).
             v_mps: their speeds, (A, K).
         """
         next_m = x_m[VUT] + v_mps[VUT] * DT_S
-        if wishes is None:
-            wishes = np.full(len(self.merged), NO_WISH, dtype=np.int8)
-        self._states_wishes |= wishes != NO_WISH
-        self._wishes = np.where(self._states_wishes, wishes == MERGE, next_m >= 0.0)
+        if merge_requests is None:
+            merge_requests = np.full(len(self.merged), NO_REQUEST, dtype=np.int8)
+        self._states_requests |= merge_requests != NO_REQUEST
+        self._merge_requests = np.where(
+            self._states_requests, merge_requests == MERGE, next_m >= 0.0
+        )
         if self.driven_for.any():
             followed = follow_mps2(x_m, v_mps, self._scenario)
             answer[VUT] = np.where(self.driven_for, followed, answer[VUT])
@@ -228,4 +232,4 @@ class Merging:
 
     def _granted(self, next_m: FloatArray) -> NDArray[np.bool_]:
         """Return the granted requests, (K,), for the next positions of the VUTs, (K,)."""
-        return self._wishes & (next_m >= self.begin_m)
+        return self._merge_requests & (next_m >= self.begin_m)

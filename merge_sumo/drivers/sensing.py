@@ -6,8 +6,8 @@ import numpy as np
 
 from merge_sumo.drivers.actuation import whole_steps
 from merge_sumo.drivers.base import Driver, DriverWrapper, Scene
-from merge_sumo.drivers.following import car_met
-from merge_sumo.scenario.case import Case, FloatArray, ToldCase
+from merge_sumo.drivers.following import conflicting_car
+from merge_sumo.scenario.case import Case, FloatArray, ObservedCase
 from merge_sumo.scenario.scenario import DT_S, VUT, Scenario
 
 X, V = range(2)
@@ -91,7 +91,7 @@ class SensedDriver(DriverWrapper):
     def begin(self, corridor: int, case: Case) -> None:
         """Take the sensors of a case; the driver begins with the start that they show."""
         self._sensors[corridor] = sensors = _Sensors(case)
-        shown = ToldCase(
+        shown = ObservedCase(
             told=tuple(map(tuple, sensors.shown(sensors.start).T.tolist())),
             level=case.level,
             svo_rad=case.svo_rad,
@@ -103,12 +103,12 @@ class SensedDriver(DriverWrapper):
 
     def act(self, scene: Scene) -> FloatArray:
         """Return the answers of the driver to the scene that it sees, (K,)."""
-        x_m, v_mps, facing = scene.x_m.copy(), scene.v_mps.copy(), scene.facing
+        x_m, v_mps, conflicting = scene.x_m.copy(), scene.v_mps.copy(), scene.conflicting
         for corridor in np.flatnonzero(scene.active).tolist():
             sensors = self._sensors[corridor]
             state = np.array((scene.x_m[:, corridor], scene.v_mps[:, corridor]))
             sensors.measure(int(scene.step[corridor]), state)
             x_m[:, corridor], v_mps[:, corridor] = sensors.shown(state)
-        if facing is not None:
-            facing = car_met(x_m, v_mps, self.scenario)
-        return self._driver.act(scene._replace(x_m=x_m, v_mps=v_mps, facing=facing))
+        if conflicting is not None:
+            conflicting = conflicting_car(x_m, v_mps, self.scenario)
+        return self._driver.act(scene._replace(x_m=x_m, v_mps=v_mps, conflicting=conflicting))

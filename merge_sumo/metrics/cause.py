@@ -70,7 +70,7 @@ def diagnose(trajectory: Trajectory, measures: Measures) -> Diagnosis:
 
     In traffic the POV is the car that is nearest to the VUT at the end.
     """
-    seen = trajectory.facing(VEHICLES.index(measures.nearest))
+    seen = trajectory.with_pov(VEHICLES.index(measures.nearest))
     vut_s, pov_s = _brakes_s(seen.v_vut_mps), _brakes_s(seen.v_pov_mps)
     return Diagnosis(
         vut_s,
@@ -261,7 +261,7 @@ def heading(outcome: Outcome, trajectory: Trajectory | None) -> str:
         trajectory: its motion; None where that is lost.
     """
     found = outcome.measures
-    text = found.became.lower()
+    text = found.result.lower()
     if outcome.failed:
         kind = None if trajectory is None else diagnose(trajectory, found).kind
         text = f"{kind or 'failure'}, {text}"

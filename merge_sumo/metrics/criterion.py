@@ -108,11 +108,11 @@ class Criterion:
             try_formula(self.require)
             return
         recorded = measures_in(scenario)
-        for name in sorted(condition_of(self.words).names - recorded.keys()):
+        for name in sorted(condition_of(self.condition).names - recorded.keys()):
             if MEASURES[name].only_with == FOLLOW_UP:
                 raise UserError(
                     f"`fail_when` speaks of {name}, which is measured "
-                    f"{scenario.said('after M')}: say how long with `follow_up_s` SECONDS"
+                    f"{scenario.wording('after M')}: say how long with `follow_up_s` SECONDS"
                 )
             if MEASURES[name].only_with == LANE:
                 raise UserError(
@@ -126,26 +126,27 @@ class Criterion:
         return self.fail_when == PAPER and self.require is None
 
     @property
-    def speaks_of_score(self) -> bool:
+    def uses_score(self) -> bool:
         """Whether it is a condition on the score, whose margin may be that of the score."""
-        return self.require is None and "score" in condition_of(self.words).names
+        return self.require is None and "score" in condition_of(self.condition).names
 
-    def said(self, scenario: Scenario) -> str:
+    def description(self, scenario: Scenario) -> str:
         """Return when a case of a scenario fails, in the words that a user reads."""
         if self.is_papers:
             limit = f"{scenario.dx_crash_m:g} m"
             return f"front bumpers are within {limit} when the VUT reaches {scenario.goal}"
-        return self.words
+        return self.condition
 
     @property
-    def text(self) -> str:
+    def as_written(self) -> str:
         """The criterion as a user writes it."""
         return self.fail_when if self.require is None else f"not ({self.require})"
 
     @property
-    def words(self) -> str:
+    def condition(self) -> str:
         """Return when a case fails, as a condition."""
-        return CRITERIA[self.text].condition if self.text in CRITERIA else self.text
+        named = CRITERIA.get(self.as_written)
+        return self.as_written if named is None else named.condition
 
     def margin(self, trajectory: Trajectory, measures: Measures) -> float | None:
         """Return the margin of an episode; None after an error."""
@@ -155,7 +156,7 @@ class Criterion:
             return margin_of(measures.score)
         if self.require is not None:
             return robustness(self.require, trajectory)
-        condition = condition_of(self.words)
+        condition = condition_of(self.condition)
         return condition.margin(values_of(measures, condition.names))
 
     def outcome(
@@ -173,7 +174,7 @@ class Criterion:
         margin = self.margin(trajectory, measures)
         return Outcome(index, batch, trajectory.case, measures, margin=margin)
 
-    def judged(self, trajectory: Trajectory, lines: CentreLines | None = None) -> Outcome:
+    def bare_outcome(self, trajectory: Trajectory, lines: CentreLines | None = None) -> Outcome:
         """Return the outcome of an episode outside of campaigns, with the measures it needs.
 
         Args:
@@ -197,7 +198,7 @@ class Criterion:
         if self.is_papers:
             last, crash_m = trajectory.motion[-1, :, 0], trajectory.case.scenario.dx_crash_m
             return bool(abs(abs(last[trajectory.nearest] - last[VUT]) - crash_m) <= rounding)
-        margin = self.judged(trajectory, lines).margin
+        margin = self.bare_outcome(trajectory, lines).margin
         return margin is not None and abs(margin) <= rounding
 
 

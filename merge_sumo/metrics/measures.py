@@ -206,7 +206,7 @@ class Measures:
         Measures.__init__(self, **values)
 
     @property
-    def became(self) -> str:
+    def result(self) -> str:
         """The result of the episode in a word: its severity, or its end where it has none."""
         return self.severity or self.end.value
 

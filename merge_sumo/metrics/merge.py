@@ -154,7 +154,7 @@ def meanings(scenario: Scenario) -> dict[Severity, str]:
     if not scenario.follow_up_s:
         del found[Severity.HARSH]
         found[Severity.CONTACT] = "bodies touch at M"
-    return {severity: scenario.said(meaning) for severity, meaning in found.items()}
+    return {severity: scenario.wording(meaning) for severity, meaning in found.items()}
 
 
 def check_from(from_s: float | None) -> None:

@@ -2,7 +2,7 @@
 
 P = MU_CRASH I_crash + MU_SAFETY P_safety + MU_TASK P_task is never positive, and P < -500 exactly
 when the front bumpers are within 6 m as the VUT reaches M, which the paper calls a crash; bodies
-need not touch then (`severity.py`). A surrogate must be able to learn P, so it falls smoothly over
+need not touch then (`merge.py`). A surrogate must be able to learn P, so it falls smoothly over
 tens of metres towards that limit, jumps little there, and continues to fall beyond it.
 """
 

@@ -74,13 +74,13 @@ def _one_verdict(outcomes: Sequence[Outcome], criterion: Criterion) -> Iterator[
     is_own = criterion.require is None and criterion.fail_when not in CRITERIA
     if not is_own or 0 < failures < len(judged):
         return
-    for text, why in _with_other_thresholds(criterion.words):
+    for text, why in _with_other_thresholds(criterion.condition):
         other = condition_of(text)
         met = sum(other.margin(values_of(outcome.measures)) < 0.0 for outcome in judged)
         if 0 < met < len(judged):
             every = "every case fails" if failures else "no case fails"
             yield (
-                f"{every} under {criterion.words}; with {text} ({why}) {met} of "
+                f"{every} under {criterion.condition}; with {text} ({why}) {met} of "
                 f"{counted(len(judged), 'case')} would"
             )
             return

@@ -269,7 +269,7 @@ _VARYING = re.compile(r"0x[0-9a-fA-F]+|[-+]?\d+(?:\.\d+(?:e[-+]?\d+)?|e[-+]?\d+)
 
 
 @dataclass(frozen=True, slots=True)
-class Trouble:
+class ErrorGroup:
     """Cases that ended without a test, in the same way.
 
     Attributes:
@@ -299,7 +299,7 @@ class Verdict:
         contacts: failures in which bodies touch at or after the merge point.
         errors: cases that ended as VUT_ERROR or SIM_ERROR.
         timeouts: cases in which the VUT never reached its goal.
-        troubles: errors and timeouts by message: errors first, then the most frequent.
+        error_groups: errors and timeouts by message: errors first, then the most frequent.
         goal: place that the VUT reaches in a case that is tested.
     """
 
@@ -309,7 +309,7 @@ class Verdict:
     contacts: int
     errors: int
     timeouts: int
-    troubles: tuple[Trouble, ...]
+    error_groups: tuple[ErrorGroup, ...]
     goal: str
 
     @property
@@ -347,13 +347,13 @@ class Verdict:
         counts = f"{', '.join(others)} and {last}" if others else last
         return f"{counts} in {counted(self.cases, 'case')}"
 
-    def trouble_lines(self) -> list[str]:
+    def error_lines(self) -> list[str]:
         """Return lines on errors and timeouts by message; none where there are none."""
         lines = []
-        for one in self.troubles[:MOST_MESSAGES]:
+        for one in self.error_groups[:MOST_MESSAGES]:
             first = f"the first in case {one.cases[0]}: {one.message}"
             lines.append(f"  {one.count} {one.end}, {first}")
-        others = self.troubles[MOST_MESSAGES:]
+        others = self.error_groups[MOST_MESSAGES:]
         if others:
             number = sum(one.count for one in others)
             lines.append(f"  {number} with {len(others)} other messages")
@@ -361,12 +361,12 @@ class Verdict:
 
     def to_record(self) -> dict[str, Any]:
         """Return contacts, errors and timeouts as JSON has them."""
-        troubles = []
-        for one in self.troubles:
+        error_groups = []
+        for one in self.error_groups:
             example = {"end": one.end, "message": one.message, "cases": one.count}
-            troubles.append(example | {"example": one.cases[0]})
+            error_groups.append(example | {"example": one.cases[0]})
         counts = {"contacts": self.contacts, "errors": self.errors, "timeouts": self.timeouts}
-        return counts | {"troubles": troubles}
+        return counts | {"error_groups": error_groups}
 
 
 def judge(outcomes: Sequence[Outcome], tolerated: float = 0.0) -> Verdict:
@@ -385,14 +385,14 @@ def judge(outcomes: Sequence[Outcome], tolerated: float = 0.0) -> Verdict:
             # Messages that differ in numbers and addresses alone are one.
             pattern = _VARYING.sub("#", message_of(outcome))
             groups.setdefault((end, pattern), []).append(outcome)
-    troubles = []
+    error_groups = []
     for (end, _), same in groups.items():
         indices = tuple(outcome.index for outcome in same)
-        troubles.append(Trouble(end, message_of(same[0]), indices))
-    troubles.sort(key=lambda one: (not one.end.is_error, -one.count, one.cases[0]))
+        error_groups.append(ErrorGroup(end, message_of(same[0]), indices))
+    error_groups.sort(key=lambda one: (not one.end.is_error, -one.count, one.cases[0]))
     goal = cases[0].case.scenario.goal if cases else US23.goal
     return Verdict(
-        len(cases), failures, len(unsure), contacts, errors, timeouts, tuple(troubles), goal
+        len(cases), failures, len(unsure), contacts, errors, timeouts, tuple(error_groups), goal
     )
 
 

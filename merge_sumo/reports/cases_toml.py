@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 
 from merge_sumo.analysis.cases_file import TOLERANCE, CasesFile, Head, policies_of, verdict_of
 from merge_sumo.analysis.comparison import GOT_WORSE, Comparison, passes, short
-from merge_sumo.campaigns.run import Run, spread_failures
+from merge_sumo.campaigns.recorded import RecordedCampaign, spread_failures
 from merge_sumo.errors import notice
 from merge_sumo.files import check_new, make_folder, write_new
 from merge_sumo.metrics.cause import cause
@@ -68,7 +68,7 @@ def with_file(compared: Comparison, file: CasesFile, path: Path) -> Comparison:
     return replace(compared, text=text, notes=tuple(map(printable, notes)))
 
 
-def watching(run: Run) -> list[Outcome]:
+def watching(run: RecordedCampaign) -> list[Outcome]:
     """Return at most 40 outcomes of a campaign: of more, those that detect changes of a controller.
 
     A quarter are the worst failures of regions. The others pass where enough cases do: of each
@@ -111,7 +111,7 @@ def new_file_in(target: Path, name: str) -> Path:
     return target / name
 
 
-def write_cases(run: Run, indices: Sequence[int], target: Path) -> Path:
+def write_cases(run: RecordedCampaign, indices: Sequence[int], target: Path) -> Path:
     """Write a cases file.
 
     Args:
@@ -138,7 +138,7 @@ def write_cases(run: Run, indices: Sequence[int], target: Path) -> Path:
     return path
 
 
-def cases_toml(run: Run, outcomes: Iterable[Outcome], path: Path, vut: str) -> str:
+def cases_toml(run: RecordedCampaign, outcomes: Iterable[Outcome], path: Path, vut: str) -> str:
     """Return the text of a cases file.
 
     Args:
@@ -176,7 +176,7 @@ def _scenario(scenario: Scenario, path: Path) -> dict[str, Any]:
     return record
 
 
-def _line(run: Run, outcome: Outcome) -> str:
+def _line(run: RecordedCampaign, outcome: Outcome) -> str:
     """Return the line of a case: verdict and deciding measures, its place, and its acceptance."""
     record = outcome.to_record() | {"margin": outcome.margin, "verdict": verdict_of(outcome)}
     if outcome.measures.end.is_tested:
@@ -185,7 +185,7 @@ def _line(run: Run, outcome: Outcome) -> str:
         record["accepted"] = run.accepted.get(outcome.index)
     names = ["index", "level", "verdict", "end", "severity", "margin"]
     if not run.criterion.require:
-        names += sorted(condition_of(run.criterion.words).names)
+        names += sorted(condition_of(run.criterion.condition).names)
     line = {name: short(record.get(name)) for name in (*names, "error")}
     places = [dimension.field for dimension in run.scenario.dimensions(outcome.case.level)]
     for name in (*places, "draw", "accepted"):

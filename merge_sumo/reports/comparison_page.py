@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from merge_sumo.analysis.comparison import Change, Comparison, Step, compare_against
-from merge_sumo.campaigns.run import AGAINST, Run
+from merge_sumo.campaigns.recorded import AGAINST, RecordedCampaign
 from merge_sumo.files import GENERATOR, replace_own
 from merge_sumo.metrics.cause import cause
 from merge_sumo.metrics.summary import judge
@@ -31,7 +31,7 @@ AGAINST_PAGE = f"{AGAINST}{PAGE}"
 STYLES = ("report.css", "comparison.css")
 
 
-def write_against(run: Run) -> None:
+def write_against(run: RecordedCampaign) -> None:
     """Write the page of a campaign against an earlier version into its folder; else do nothing."""
     compared = compare_against(run)
     if compared is not None:

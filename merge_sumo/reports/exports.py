@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from merge_sumo.campaigns.campaign import SCENARIOS, case_name, export_case
-from merge_sumo.campaigns.run import Run
+from merge_sumo.campaigns.recorded import RecordedCampaign
 from merge_sumo.errors import UserError
 from merge_sumo.files import check_own, make_folder, new_file, write_folder
 from merge_sumo.metrics.bodies import WIDTH_M
@@ -44,7 +44,7 @@ FORMATS = {
 
 
 def export_cases(
-    run: Run, indices: Sequence[int], file_format: str, target: Path | None = None
+    run: RecordedCampaign, indices: Sequence[int], file_format: str, target: Path | None = None
 ) -> list[Path]:
     """Write cases of a campaign in a format of `FORMATS`.
 
@@ -79,7 +79,7 @@ def export_cases(
     return [write(run, index, target / case_name(index), road) for index in indices]
 
 
-def write_table(run: Run, indices: Sequence[int], target: Path) -> Path:
+def write_table(run: RecordedCampaign, indices: Sequence[int], target: Path) -> Path:
     """Write the motion of cases, or of all, as one table with a row for each step.
 
     Args:
@@ -124,7 +124,7 @@ def _motion(scenario: Scenario) -> list[str]:
     return names
 
 
-def _rows(run: Run, index: int) -> Iterator[dict[str, Any]]:
+def _rows(run: RecordedCampaign, index: int) -> Iterator[dict[str, Any]]:
     """Yield the rows of a case by column; a text that begins as a formula gets a quote."""
     trajectory, scenario = run.trajectory(index), run.scenario
     names, merged = _motion(scenario), merged_rows(trajectory)
@@ -144,7 +144,7 @@ def _rows(run: Run, index: int) -> Iterator[dict[str, Any]]:
         yield row
 
 
-def write_openscenario(run: Run, index: int, folder: Path, road: Corridor) -> Path:
+def write_openscenario(run: RecordedCampaign, index: int, folder: Path, road: Corridor) -> Path:
     """Write a case as OpenDRIVE and as two OpenSCENARIO files; return the path of the first.
 
     In the first all cars follow their recorded trajectories. In the second, `...-free.xosc`, the
@@ -176,7 +176,7 @@ def write_openscenario(run: Run, index: int, folder: Path, road: Corridor) -> Pa
         }
         cars.append(car)
     files = {ROAD: opendrive(road)}
-    became = run.outcome(index).measures.became
+    became = run.outcome(index).measures.result
     for suffix, title, free in (("-free", "free VUT", True), ("", became, False)):
         text = (
             environment()

@@ -16,7 +16,13 @@ from merge_sumo.analysis.counterfactuals import AVOIDANCE
 from merge_sumo.analysis.probability import PROBABILITY
 from merge_sumo.analysis.share import SHARES
 from merge_sumo.analysis.stress import STRESS
-from merge_sumo.campaigns.run import OUTCOMES, SETTINGS, TRAJECTORIES, Run, failures
+from merge_sumo.campaigns.recorded import (
+    OUTCOMES,
+    SETTINGS,
+    TRAJECTORIES,
+    RecordedCampaign,
+    failures,
+)
 from merge_sumo.drivers.reference import REFERENCES
 from merge_sumo.metrics.cause import heading
 from merge_sumo.metrics.fmc import radius_for
@@ -82,7 +88,7 @@ class Fact:
 Facts = Iterator[Fact]
 
 
-def facts_of(run: Run, summary: Summary, verdict: Verdict) -> list[Fact]:
+def facts_of(run: RecordedCampaign, summary: Summary, verdict: Verdict) -> list[Fact]:
     """Return the facts of a campaign and of the studies in its folder.
 
     Args:
@@ -93,7 +99,7 @@ def facts_of(run: Run, summary: Summary, verdict: Verdict) -> list[Fact]:
     Raises:
         UserError: a file of a study is damaged.
     """
-    failing = run.criterion.words if run.criterion.is_papers else "margin < 0"
+    failing = run.criterion.condition if run.criterion.is_papers else "margin < 0"
     unsure = undecided(run.outcomes, run.tolerated)
     facts = [*_settings(run), *_shares(run), *_counts(run, summary, verdict, failing)]
     for level, found in summary.levels.items():
@@ -114,17 +120,17 @@ def by_level(facts: Iterable[Fact]) -> dict[int, dict[str, Fact]]:
     return rows
 
 
-def _settings(run: Run) -> Facts:
+def _settings(run: RecordedCampaign) -> Facts:
     settings, criterion = run.settings, run.criterion
     yield Fact("VUT", run.vut, "vut", file=SETTINGS)
     yield Fact("scenario", run.scenario.name, "scenario.name", file=SETTINGS)
     key = "fail_when" if criterion.require is None else "require"
-    yield Fact(RULE, criterion.said(run.scenario), key, file=SETTINGS)
+    yield Fact(RULE, criterion.description(run.scenario), key, file=SETTINGS)
     sampler = f"{settings.sampler}, seed {settings.seed}"
     yield Fact("sampler", sampler, "sampler, seed", file=SETTINGS)
 
 
-def _shares(run: Run) -> Facts:
+def _shares(run: RecordedCampaign) -> Facts:
     known = SHARES.read(run.folder)
     if known is None:
         return
@@ -138,7 +144,7 @@ def _shares(run: Run) -> Facts:
                 yield fact(name, one.without_verdict, "levels: without_verdict")
 
 
-def _counts(run: Run, summary: Summary, verdict: Verdict, failing: str) -> Facts:
+def _counts(run: RecordedCampaign, summary: Summary, verdict: Verdict, failing: str) -> Facts:
     yield Fact("cases", summary.cases, "lines")
     if run.converged:
         yield Fact(AT_MOST, run.settings.cases, "cases", file=SETTINGS)
@@ -161,7 +167,7 @@ def _counts(run: Run, summary: Summary, verdict: Verdict, failing: str) -> Facts
             yield Fact(name, passing[severity], f"severity: {severity}, not {failing}")
 
 
-def _of_level(run: Run, level: int, found: LevelSummary, failing: str) -> Facts:
+def _of_level(run: RecordedCampaign, level: int, found: LevelSummary, failing: str) -> Facts:
     fact = partial(Fact, level=level)
     yield fact("cases", found.cases, "level")
     if found.tested < found.cases:
@@ -201,7 +207,7 @@ def _values(outcomes: Iterable[Outcome], measure: str) -> list[Any]:
     return values
 
 
-def _repeats(run: Run) -> Facts:
+def _repeats(run: RecordedCampaign) -> Facts:
     cases = by_case(run.outcomes)
     repeated = [case for case in cases if case.runs > 1]
     if run.tolerated or repeated:
@@ -214,7 +220,7 @@ def _repeats(run: Run) -> Facts:
         yield Fact(name, 100.0 * run.tolerated, "tolerated", PERCENT, SETTINGS)
 
 
-def _motion(run: Run, unsure: set[int], failing: str) -> Facts:
+def _motion(run: RecordedCampaign, unsure: set[int], failing: str) -> Facts:
     key = f"t_end_s; the follow-up by {TRAJECTORIES}/"
     yield Fact("simulated time", run.simulated_s / 3600.0, key, "h")
     failed = failures(run.cases)
@@ -236,7 +242,7 @@ def _motion(run: Run, unsure: set[int], failing: str) -> Facts:
             yield Fact(name, max(values), f"{failing}: {key}", unit)
 
 
-def _avoided(run: Run, unsure: set[int]) -> Facts:
+def _avoided(run: RecordedCampaign, unsure: set[int]) -> Facts:
     known = [one for one in AVOIDANCE.read_lines(run) if one.index not in unsure]
     if not known:
         return
@@ -249,7 +255,7 @@ def _avoided(run: Run, unsure: set[int]) -> Facts:
     yield fact(AVOIDED_BY_POV, sum(one.pov_careful for one in known), "pov_careful")
 
 
-def _studies(run: Run) -> Facts:
+def _studies(run: RecordedCampaign) -> Facts:
     stress = STRESS.read(run.folder)
     if stress is not None and stress.failures:
         name = f"failures that stay failures in all {stress.runs} runs of the stress test"

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from merge_sumo.analysis.comparison import GOT_WORSE, Change, Comparison, Step, compare_against
 from merge_sumo.analysis.counterfactuals import causes
-from merge_sumo.campaigns.run import NAME_CHARACTERS, Run
+from merge_sumo.campaigns.recorded import NAME_CHARACTERS, RecordedCampaign
 from merge_sumo.errors import UserError
 from merge_sumo.files import check_new, write_new
 from merge_sumo.metrics.summary import GateResult, Verdict, by_case, undecided
@@ -54,7 +54,11 @@ def check_junit(path: Path, folder: Path) -> None:
 
 
 def write_junit(
-    path: Path, run: Run, facts: Sequence[Fact], verdict: Verdict, gates: Sequence[GateResult]
+    path: Path,
+    run: RecordedCampaign,
+    facts: Sequence[Fact],
+    verdict: Verdict,
+    gates: Sequence[GateResult],
 ) -> None:
     """Write the JUnit file of a campaign.
 
@@ -110,7 +114,7 @@ def _write(
     write_new(path, text.strip().encode(), "`junit`")
 
 
-def _cases(run: Run) -> list[TestCase]:
+def _cases(run: RecordedCampaign) -> list[TestCase]:
     runs = {}
     for case in by_case(run.outcomes):
         if case.runs > 1:

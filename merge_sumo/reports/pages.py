@@ -52,10 +52,13 @@ def source_of(name: str) -> str:
 @cache
 def environment() -> Environment:
     """Return the templates' environment, with the functions that every template has."""
-    from jinja2 import Environment, PackageLoader
+    from jinja2 import Environment, PackageLoader, StrictUndefined
 
     made = Environment(
-        loader=PackageLoader("merge_sumo.reports"), autoescape=True, trim_blocks=True
+        loader=PackageLoader("merge_sumo.reports"),
+        autoescape=True,
+        trim_blocks=True,
+        undefined=StrictUndefined,
     )
     made.globals |= {"level_name": level_name, "described": described, "x_axis": X_AXIS}
     made.globals |= {"counted": counted, "quoted": quoted, "sentence": sentence}

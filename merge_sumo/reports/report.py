@@ -19,12 +19,12 @@ import msgspec
 from markupsafe import Markup
 
 from merge_sumo.campaigns.again import again
+from merge_sumo.campaigns.recorded import OUTCOMES, RecordedCampaign
 from merge_sumo.campaigns.repeats import read_repeats, unrepeatable
-from merge_sumo.campaigns.run import OUTCOMES, Run
 from merge_sumo.controllers.process import LOG, end_of
 from merge_sumo.drivers.reference import REFERENCES
 from merge_sumo.errors import UserError
-from merge_sumo.files import GENERATOR, check_ours, replace_own
+from merge_sumo.files import GENERATOR, check_generated, replace_own
 from merge_sumo.metrics.cause import BRAKED_MPS, MEANINGS
 from merge_sumo.metrics.fmc import radius_for
 from merge_sumo.metrics.merge import meanings
@@ -46,7 +46,7 @@ MOST_SHARE = 0.1
 """Maximum share of the time of a campaign that its reports take."""
 
 
-def write_report(run: Run) -> Path:
+def write_report(run: RecordedCampaign) -> Path:
     """Write `report.html` into the folder of a campaign, in place of an older one.
 
     A campaign against an earlier version of the VUT also gets a page of the changes.
@@ -62,7 +62,7 @@ def write_report(run: Run) -> Path:
     return run.folder / REPORT
 
 
-def _replace(run: Run, html: str) -> None:
+def _replace(run: RecordedCampaign, html: str) -> None:
     replace_own(run.folder / REPORT, html.encode(errors="backslashreplace"), GENERATOR)
 
 
@@ -104,15 +104,15 @@ class RunningReport:
     def _write(self, *, running: bool) -> None:
         self._is_there = False
         with suppress(UserError):
-            run = Run(self._folder)
+            run = RecordedCampaign(self._folder)
             _replace(run, report_page(run, learns=False, running=running))
             self._is_there = True
 
 
 def check_report(folder: Path) -> None:
     """Raise `UserError` where merge-sumo did not create the report in a folder."""
-    check_ours(folder / REPORT)
-    check_ours(folder / AGAINST_PAGE)
+    check_generated(folder / REPORT)
+    check_generated(folder / AGAINST_PAGE)
 
 
 LEVEL_ABOUT = {
@@ -123,7 +123,7 @@ LEVEL_ABOUT = {
 """Conduct of the POV of a level, in the words of a caption."""
 
 
-def report_page(run: Run, *, learns: bool = True, running: bool = False) -> str:
+def report_page(run: RecordedCampaign, *, learns: bool = True, running: bool = False) -> str:
     """Return the report of a campaign as HTML.
 
     Args:

@@ -52,7 +52,9 @@ def page_data(model: ReportModel) -> dict[str, Any]:
     measures = []
     for name, measure in measures_in(scenario).items():
         if measure.column and any(value is not None for value in cases.get(name, ())):
-            title = f"{scenario.said(measure.column)} {measure.unit}".replace("s2", "s²").rstrip()
+            title = f"{scenario.wording(measure.column)} {measure.unit}".replace(
+                "s2", "s²"
+            ).rstrip()
             measures.append({"name": name, "title": title, "digits": measure.digits})
     axes = []
     for c in model.coordinates:

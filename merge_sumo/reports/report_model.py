@@ -11,11 +11,11 @@ from merge_sumo.analysis.explanation import EXPLANATIONS
 from merge_sumo.analysis.stress import STRESS
 from merge_sumo.analysis.surface import Surface, learn_surface
 from merge_sumo.campaigns.again import again, call, command
-from merge_sumo.campaigns.run import Run, failures, regions_of, spread_failures
+from merge_sumo.campaigns.recorded import RecordedCampaign, failures, regions_of, spread_failures
 from merge_sumo.errors import UserError
 from merge_sumo.metrics.cause import Diagnosis, FailureBox, Kind, diagnose, failure_boxes
 from merge_sumo.metrics.outcome import Outcome
-from merge_sumo.metrics.summary import Trouble, by_case, judge, summarise, undecided
+from merge_sumo.metrics.summary import ErrorGroup, by_case, judge, summarise, undecided
 from merge_sumo.reports.facts import facts_of
 from merge_sumo.road.merge import road_for, road_of
 from merge_sumo.scenario.case import coordinates
@@ -54,7 +54,7 @@ class ReportModel:
         worst: failures, the worst first.
         spread: the listed failures: the worst of each region first.
         near: cases that do not fail, those nearest to a failure first.
-        troubles: messages of errors and timeouts, with the listed cases of each.
+        error_groups: messages of errors and timeouts, with the listed cases of each.
         shown: cases that the page holds one by one, in their order.
         regions: region of each failure, by its index.
         motion: trajectories of the shown cases by index; lost ones are missing.
@@ -68,7 +68,7 @@ class ReportModel:
         >>> model.worst[0].index, model.verdict.counts
     """
 
-    def __init__(self, run: Run, *, learns: bool = True) -> None:
+    def __init__(self, run: RecordedCampaign, *, learns: bool = True) -> None:
         """Read the content.
 
         Args:
@@ -138,11 +138,11 @@ class ReportModel:
             self.spread.sort(key=lambda outcome: outcome.index not in robust)
         self.spread = self.spread[:LISTED]
         self.near = sorted(passing, key=lambda outcome: (outcome.margin, outcome.index))
-        self.troubles: list[tuple[Trouble, list[Outcome]]] = []
+        self.error_groups: list[tuple[ErrorGroup, list[Outcome]]] = []
         first: list[Outcome] = []
-        for trouble in self.verdict.troubles[:LISTED]:
+        for trouble in self.verdict.error_groups[:LISTED]:
             examples = [self.run.outcome(index) for index in trouble.cases[:LISTED]]
-            self.troubles.append((trouble, examples))
+            self.error_groups.append((trouble, examples))
             first += examples
         first += self.spread + self.near[:LISTED] + self.worst + untested + self.near
         by_index = {outcome.index: outcome for outcome in first}

@@ -30,7 +30,7 @@ from merge_sumo.analysis.stress import StressResult
 from merge_sumo.analysis.truth import DENSE_CASES, REAL_REGION, Truth, TruthResult
 from merge_sumo.analysis.vut_check import VutCheck
 from merge_sumo.campaigns.again import again, command
-from merge_sumo.campaigns.run import Run
+from merge_sumo.campaigns.recorded import RecordedCampaign
 from merge_sumo.drivers.reference import REFERENCES
 from merge_sumo.metrics.cause import cause, conflicting_car
 from merge_sumo.metrics.criterion import Criterion
@@ -80,7 +80,7 @@ def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
 # Campaigns
 
 
-def headline(run: Run, facts: Sequence[Fact]) -> list[str]:
+def headline(run: RecordedCampaign, facts: Sequence[Fact]) -> list[str]:
     """Return the first lines about a campaign; their numbers are facts."""
     of = {fact.name: fact for fact in facts if fact.level is None}
     levels = by_level(facts)
@@ -205,7 +205,7 @@ def comparison(compared: Comparison) -> list[str]:
     for number, version in enumerate(compared.versions, start=1):
         verdict = judge(version.outcomes, version.tolerated)
         text.append(f"{number}: {version.folder or 'now'} ({version.vut}): {verdict.counts}")
-        text += verdict.trouble_lines()
+        text += verdict.error_lines()
         for late in late_errors(version.outcomes):
             text.append(f"  {late}")
     for level, row in fmc_rows(compared).items():
@@ -280,7 +280,7 @@ def truths(found: TruthResult) -> list[str]:
         lines.append(line)
         for remark in truth_remarks(truth):
             lines.append(f"  {remark}")
-    return [*lines, f"  a case fails when {found.criterion.said(found.scenario)}"]
+    return [*lines, f"  a case fails when {found.criterion.description(found.scenario)}"]
 
 
 def _spread(spread: Spread, form: str) -> str:
@@ -405,7 +405,7 @@ def probability(found: ProbabilityResult) -> list[str]:
             lines.append(f"  level {level_name(level)}: P(fail) {_interval(estimate)}")
     criterion = Criterion(found.campaign["fail_when"], found.campaign["require"])
     scenario = replace(US23, dx_crash_m=found.campaign["scenario"]["dx_crash_m"])
-    lines.append(f"  a case fails when {criterion.said(scenario)}")
+    lines.append(f"  a case fails when {criterion.description(scenario)}")
     if found.without_verdict:
         lines.append(
             f"  {found.without_verdict} not judged (error or timeout): safe for lower ends, "
@@ -562,7 +562,7 @@ def _measures(outcome: Outcome) -> Iterator[str]:
     for name, measure in measures_in(scenario).items():
         value = found.value(name)
         if measure.label and value is not None:
-            label = scenario.said(measure.label).replace("POV", car)
+            label = scenario.wording(measure.label).replace("POV", car)
             rows.append((label, f"{value:10.2f} {measure.unit}"))
     if found.clipped_steps:
         rows.append(("steps beyond its limits", f"{found.clipped_steps:10d}"))

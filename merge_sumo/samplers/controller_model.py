@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from merge_sumo.drivers.following import car_met, keep_safe
+from merge_sumo.drivers.following import conflicting_car, keep_safe
 from merge_sumo.drivers.levelk import (
     DECISION_STEPS,
     QNetwork,
@@ -91,7 +91,7 @@ class Observation:
         x_pov, v_pov, x_vut, v_vut = x_m[POV], v_mps[POV], x_m[VUT], v_mps[VUT]
         traffic = []
         if len(x_m) > 2:
-            conflicting = car_met(x_m, v_mps, scenario)
+            conflicting = conflicting_car(x_m, v_mps, scenario)
             rows = np.arange(len(conflicting))
             x_pov, v_pov = x_m[conflicting, rows], v_mps[conflicting, rows]
             traffic.append(conflicting)
@@ -188,7 +188,7 @@ class ModelRollout:
             if not np.isnan(gaps_m[row]):
                 end, after = End.MERGED, self._follow_up(of_row[-1])
             trajectory = Trajectory(case, of_row, end, after=after)
-            gaps[row] = self._criterion.judged(trajectory, self._lines).signed_gap
+            gaps[row] = self._criterion.bare_outcome(trajectory, self._lines).signed_gap
         return gaps.reshape(len(drives), -1)
 
     def _follow_up(self, at_m: FloatArray) -> FloatArray | None:

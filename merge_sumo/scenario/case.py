@@ -161,7 +161,7 @@ class Case:
         return self._hashed((self.level, self.svo_rad, self.starts()))
 
     @property
-    def told_seed(self) -> int:
+    def controller_seed(self) -> int:
         """The seed for a controller, which knows neither level nor orientation."""
         return self._hashed([(float(x), float(v)) for x, v in self.starts()])
 
@@ -186,7 +186,7 @@ class Case:
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class ToldCase(Case):
+class ObservedCase(Case):
     """The part of a case that the driver of a vehicle knows: where vehicles start, and own limits.
 
     It is not checked: a sensor may show a car anywhere.

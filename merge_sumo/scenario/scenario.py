@@ -341,7 +341,7 @@ class Scenario:
         """M; on an acceleration lane, where M is only expected, the merge."""
         return "M" if self.lane_m is None else "the merge"
 
-    def said(self, text: str) -> str:
+    def wording(self, text: str) -> str:
         """Return a text with M, where M is only expected with "the merge" in its place."""
         if self.lane_m is None:
             return text

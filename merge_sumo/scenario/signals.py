@@ -17,7 +17,7 @@ from msgspec import Meta
 from merge_sumo.errors import UserError
 from merge_sumo.printable import printable
 
-Left = dict[str, float | str]
+StepSignals = dict[str, float | str]
 """Values of one step, by name."""
 Signals = dict[str, tuple[float | str | None, ...]]
 """By name, a value for each row of the motion of a case; None where none was left."""
@@ -28,14 +28,14 @@ CHARACTERS = 40
 """Of a name, and of a word."""
 
 
-def as_signals(left: object) -> Left:
+def as_signals(left: object) -> StepSignals:
     """Return the numbers and words that a controller has left; other values are dropped.
 
     Numbers have six digits, names and words are cut. A number that is not finite is none.
     """
     if not isinstance(left, dict):
         return {}
-    kept: Left = {}
+    kept: StepSignals = {}
     for name, value in islice(left.items(), MOST_NAMES):
         known = _value(value)
         if known is not None and isinstance(name, str):
@@ -60,7 +60,7 @@ def _word(text: str) -> str:
     return printable(str.__str__(text)[:CHARACTERS])[:CHARACTERS]
 
 
-def series(left: Iterable[tuple[int, Left]], rows: int) -> Signals | None:
+def series(left: Iterable[tuple[int, StepSignals]], rows: int) -> Signals | None:
     """Return the signals of a case by its number of rows and the values left: (row, by name).
 
     None where nothing was left. Of more than `MOST_NAMES`, the first ones.

@@ -124,7 +124,7 @@ class Trajectory:
         cars = [row for row in range(self.motion.shape[1]) if row != VUT]
         return min(cars, key=lambda row: abs(self.motion[-1, row, 0] - self.motion[-1, VUT, 0]))
 
-    def facing(self, car: int) -> Trajectory:
+    def with_pov(self, car: int) -> Trajectory:
         """Return the motion up to M of the VUT and one car of the mainline, in the POV's row."""
         return replace(self, motion=self.motion[:, [car, VUT]], after=None)
 

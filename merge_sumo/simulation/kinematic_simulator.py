@@ -1,7 +1,7 @@
 """The kinematic engine: vehicles are moved by eq. (4) alone, and SUMO checks a share of the cases.
 
-SUMO holds the state that eq. (4) gives, to rounding errors (`sumo/world.py` checks that in every
-step). Where the VUT and the POVs are drivers of this package, which need nothing of SUMO, an
+SUMO holds the state that eq. (4) gives, to rounding errors (`sumo/sumo_simulation.py` checks it in
+every step). Where the VUT and the POVs are drivers of this package, which need nothing of SUMO, an
 episode has the same end without it, and takes a tenth of the time. At least one case of a hundred,
 drawn at random, runs in SUMO as well, and the two must agree. A case that a rounding error could
 decide otherwise is decided by SUMO.
@@ -22,7 +22,7 @@ from merge_sumo.road.merge import centre_lines
 from merge_sumo.scenario.case import Case, described
 from merge_sumo.scenario.scenario import VUT
 from merge_sumo.scenario.trajectory import Trajectory
-from merge_sumo.simulation.kinematic_world import EquationWorld
+from merge_sumo.simulation.kinematic_simulation import KinematicSimulation
 from merge_sumo.simulation.plan import Engine, SimulationPlan
 from merge_sumo.simulation.simulator import Simulator, corridors_of
 
@@ -54,8 +54,8 @@ class KinematicSimulator(Simulator):
         most = CORRIDORS if plan.needs_sumo is None else plan.corridors
         with ExitStack() as opened:
             corridors = corridors_of(plan, most)
-            world = EquationWorld(corridors, plan.road, plan.scenario, plan.substeps)
-            self._open_drivers(plan, world, opened)
+            simulation = KinematicSimulation(corridors, plan.road, plan.scenario, plan.substeps)
+            self._open_drivers(plan, simulation, opened)
 
     def run(self, cases: Sequence[Case]) -> list[Trajectory]:
         """Run cases; return their trajectories in order.
@@ -107,7 +107,8 @@ class KinematicSimulator(Simulator):
             and kinematic.motion.shape == sumo.motion.shape
             and ours.shape == theirs.shape
             and np.abs(ours - theirs)[..., :2].max() <= ROUNDING
-            and criterion.judged(kinematic, lines).failed == criterion.judged(sumo, lines).failed
+            and criterion.bare_outcome(kinematic, lines).failed
+            == criterion.bare_outcome(sumo, lines).failed
         ):
             return
         case = kinematic.case

@@ -11,7 +11,7 @@ import numpy as np
 from merge_sumo.controllers.kinds import load
 from merge_sumo.controllers.spec import ControllerKind, ControllerOptions
 from merge_sumo.controllers.sumo_model import SumoVut
-from merge_sumo.drivers.base import Driver, DriverWrapper, PovLostError, Scene, VutLostError
+from merge_sumo.drivers.base import ControllerDiedError, Driver, DriverWrapper, PovDiedError, Scene
 from merge_sumo.drivers.level0 import Level0Pov
 from merge_sumo.drivers.policies import (
     how_to_train,
@@ -22,7 +22,7 @@ from merge_sumo.drivers.policies import (
 )
 from merge_sumo.errors import UserError
 from merge_sumo.files import Files
-from merge_sumo.scenario.case import Case, FloatArray, ToldCase
+from merge_sumo.scenario.case import Case, FloatArray, ObservedCase
 from merge_sumo.scenario.scenario import (
     ALL_LEVELS,
     OWN,
@@ -32,7 +32,7 @@ from merge_sumo.scenario.scenario import (
     level_name,
     names_of_levels,
 )
-from merge_sumo.sumo.world import World
+from merge_sumo.sumo.sumo_simulation import SumoSimulation
 
 POLICIES = {1: "pov1", 2: "pov2"}
 """The learned POVs by their level."""
@@ -183,17 +183,19 @@ def own_pov(text: str, options: ControllerOptions) -> ControllerKind:
 class PovLibrary(Driver):
     """Plays a POV of level 0, 1 or 2, or the user's own, corridor by corridor."""
 
-    def __init__(self, corridors: int, povs: Povs, world: World | None = None) -> None:
+    def __init__(
+        self, corridors: int, povs: Povs, simulation: SumoSimulation | None = None
+    ) -> None:
         """Prepare the drivers of all available levels."""
         super().__init__(corridors)
         self._drivers: dict[int, Driver] = {0: Level0Pov(corridors)}
         for level in set(povs.levels) & set(POLICIES):
             self._drivers[level] = load_driver(POLICIES[level], corridors, povs.policies)
         if povs.own is not None:
-            driver = povs.own.open(corridors, world)
+            driver = povs.own.open(corridors, simulation)
             if isinstance(driver, SumoVut):  # SUMO knows where its vehicles are
-                mainline = [row for row in range(driver.world.vehicles) if row != VUT]
-                self._drivers[OWN] = SumoVut(corridors, driver.world, mainline)
+                mainline = [row for row in range(driver.simulation.vehicles) if row != VUT]
+                self._drivers[OWN] = SumoVut(corridors, driver.simulation, mainline)
             else:
                 self._drivers[OWN] = PovAdapter(driver)
         self._level = np.zeros(corridors, dtype=np.int64)
@@ -243,12 +245,12 @@ class PovAdapter(DriverWrapper):
         self._driver.begin(corridor, seen_from(case, car))
 
     def act(self, scene: Scene) -> FloatArray:
-        """Return the driver's answers; raises `PovLostError`."""
+        """Return the driver's answers; raises `PovDiedError`."""
         other = scene._replace(x_m=scene.x_m[::-1], v_mps=scene.v_mps[::-1])
         try:
             return self._driver.act(other)
-        except VutLostError as lost:
-            raise PovLostError(str(lost)) from lost
+        except ControllerDiedError as lost:
+            raise PovDiedError(str(lost)) from lost
 
 
 def seen_from(case: Case, car: int) -> Case:
@@ -262,4 +264,4 @@ def seen_from(case: Case, car: int) -> Case:
     x_vut0_m = min(x_m, BEFORE_M)
     scenario = replace(case.scenario, x_vut0_m=x_vut0_m, v_vut0_mps=v_mps, lane_m=None)
     told = vut, (x_m, v_mps)
-    return ToldCase(level=0, v_vut0_mps=v_mps, draw=case.draw, scenario=scenario, told=told)
+    return ObservedCase(level=0, v_vut0_mps=v_mps, draw=case.draw, scenario=scenario, told=told)

@@ -9,20 +9,20 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from merge_sumo.drivers.actuation import ROUNDING_MPS2
-from merge_sumo.drivers.base import Driver, PovLostError, Scene, VutLostError
-from merge_sumo.drivers.following import car_met, keep_safe
+from merge_sumo.drivers.base import ControllerDiedError, Driver, PovDiedError, Scene
+from merge_sumo.drivers.following import conflicting_car, keep_safe
 from merge_sumo.drivers.lane import Merging
 from merge_sumo.scenario.case import Case, FloatArray
 from merge_sumo.scenario.scenario import DT_S, MAX_EPISODE_S, OWN, VUT
-from merge_sumo.scenario.signals import Left, series
+from merge_sumo.scenario.signals import StepSignals, series
 from merge_sumo.scenario.trajectory import End, Trajectory, cut_at
-from merge_sumo.simulation.kinematic_world import EquationWorld
-from merge_sumo.sumo.world import SimulationError, World
+from merge_sumo.simulation.kinematic_simulation import KinematicSimulation
+from merge_sumo.sumo.sumo_simulation import SimulationError, SumoSimulation
 
 RING_ROWS = round(MAX_EPISODE_S / DT_S) + 2
 """Rows of the record: an episode is copied out before its first row is written over."""
 
-WRONGS = (Exception, SystemExit)
+ANY_FAULT = (Exception, SystemExit)
 """Errors of a VUT: a black box may raise anything but the interruption by the user."""
 
 OF_THE_POV = "the POV: "
@@ -57,11 +57,11 @@ class _Running:
     first_row: int
     merge_row: int | None = None
     clipped: int = 0
-    left: list[tuple[int, Left]] = field(default_factory=list)
+    left: list[tuple[int, StepSignals]] = field(default_factory=list)
 
 
 class Rollout:
-    """Cases that run in the corridors of a world.
+    """Cases that run in the corridors of a simulation.
 
     A corridor is refilled when its episode ends, so episodes do not end in order. An episode
     depends neither on the number of corridors nor on its neighbours. An error of the VUT ends its
@@ -70,8 +70,11 @@ class Rollout:
     is at fault. When SUMO fails, the running episodes end as SIM_ERROR, and SUMO is started again
     for the others.
 
+    A fault of a controller arrives as NaN, and `Driver.reason` says why. An exception comes only
+    from a driver in this process, and `ControllerDiedError` from a process that has ended.
+
     Example:
-        trajectories = Rollout(world, pov, vut, cases).run()
+        trajectories = Rollout(simulation, pov, vut, cases).run()
 
     Attributes:
         unexplained: indices of the cases that ran again although none was at fault: something from
@@ -79,18 +82,22 @@ class Rollout:
     """
 
     def __init__(
-        self, world: World | EquationWorld, pov: Driver, vut: Driver, cases: Iterable[Case]
+        self,
+        simulation: SumoSimulation | KinematicSimulation,
+        pov: Driver,
+        vut: Driver,
+        cases: Iterable[Case],
     ) -> None:
         """Take the corridors and their drivers.
 
         Args:
-            world: the corridors.
+            simulation: the corridors.
             pov: drives all C cars of the mainline of the K corridors, as the POVs of C K corridors.
             vut: drives the VUT of each corridor.
-            cases: cases of the world's scenario.
+            cases: cases of the simulation's scenario.
         """
-        corridors, vehicles = world.corridors, len(world.x_m)
-        self.world, self.pov, self.vut = world, pov, vut
+        corridors, vehicles = simulation.corridors, len(simulation.x_m)
+        self.simulation, self.pov, self.vut = simulation, pov, vut
         self.mainline = [row for row in range(vehicles) if row != VUT]
         self.has_traffic = len(self.mainline) > 1
         self.queue = enumerate(cases)
@@ -110,10 +117,10 @@ class Rollout:
         """Error that the VUT raised instead of its last answer."""
         self.timeout_at = np.full(corridors, NEVER)
         """Rows of the record at which episodes time out."""
-        # One row per step of the world: x, v, a of every vehicle.
-        self.follow_steps = round(world.scenario.follow_up_s / DT_S)
-        has_lane = world.scenario.lane_m is not None
-        self.merging = Merging(corridors, world.scenario) if has_lane else None
+        # One row per step of the simulation: x, v, a of every vehicle.
+        self.follow_steps = round(simulation.scenario.follow_up_s / DT_S)
+        has_lane = simulation.scenario.lane_m is not None
+        self.merging = Merging(corridors, simulation.scenario) if has_lane else None
         self.ring = RING_ROWS + self.follow_steps
         self.record = np.zeros((corridors, self.ring, vehicles, 3))
         self.ended: dict[int, Trajectory] = {}
@@ -123,32 +130,32 @@ class Rollout:
 
     def run(self) -> list[Trajectory]:
         """Run all cases; return their trajectories in order."""
-        world, everywhere = self.world, range(self.world.corridors)
+        simulation, everywhere = self.simulation, range(self.simulation.corridors)
         self.refill(everywhere)
         while self.active.any():
             self.now = self.record[:, self.row % self.ring]
-            self.now[..., 0], self.now[..., 1] = world.x_m.T, world.v_mps.T
+            self.now[..., 0], self.now[..., 1] = simulation.x_m.T, simulation.v_mps.T
             self.row += 1
             try:
-                world.advance()
+                simulation.advance()
                 acceleration = self.ask_drivers()
                 merged = None
                 if self.merging is not None:
-                    merged = self.merging.step(world.x_m, world.v_mps)
-                world.command(acceleration, merged)
-            except VutLostError as lost:
+                    merged = self.merging.step(simulation.x_m, simulation.v_mps)
+                simulation.command(acceleration, merged)
+            except ControllerDiedError as lost:
                 self.begin_again(lost)
                 continue
             except SimulationError as error:
                 for corridor in np.flatnonzero(self.active).tolist():
                     self.finish(corridor, End.SIM_ERROR, f"SUMO failed: {error}")
-                world.restart()
+                simulation.restart()
                 self.errors.clear()
                 self.refill(everywhere)
                 continue
             self.step += 1
             arrived = self.active & (
-                world.scenario.has_ended(world.x_m) if merged is None else merged
+                simulation.scenario.has_ended(simulation.x_m) if merged is None else merged
             )
             ended = arrived | (self.row >= self.timeout_at)
             ended[list(self.errors)] = True
@@ -168,15 +175,15 @@ class Rollout:
 
     def follows_up(self, corridor: int) -> bool:
         """Return whether an episode continues after M; note where that begins."""
-        episode, x_m = self.episodes[corridor], self.world.x_m[:, corridor]
+        episode, x_m = self.episodes[corridor], self.simulation.x_m[:, corridor]
         assert episode is not None, "only running episodes continue"  # noqa: S101
         if episode.merge_row is None:
             episode.merge_row, episode.clipped = self.row, int(self.clipped[corridor])
             self.timeout_at[corridor] = self.row + self.follow_steps
-        end_m = self.world.road.mainline.after_m - END_OF_ROAD_M
+        end_m = self.simulation.road.mainline.after_m - END_OF_ROAD_M
         return bool(self.row < self.timeout_at[corridor] and x_m.max() < end_m)
 
-    def begin_again(self, lost: VutLostError) -> None:
+    def begin_again(self, lost: ControllerDiedError) -> None:
         """Let the running episodes begin again, one by one; end the one at fault, if any."""
         is_alone = np.count_nonzero(self.active) == 1
         for corridor, episode in enumerate(self.episodes):
@@ -185,7 +192,7 @@ class Rollout:
             self.deaths[episode.index] += is_alone
             if self.deaths[episode.index] == MAX_DEATHS:
                 self.unexplained.clear()
-                if isinstance(lost, PovLostError):
+                if isinstance(lost, PovDiedError):
                     self.finish(corridor, End.SIM_ERROR, OF_THE_POV + str(lost))
                 else:
                     self.finish(corridor, End.VUT_ERROR, str(lost))
@@ -195,7 +202,7 @@ class Rollout:
         self.errors.clear()
         self.active[:] = False
         self.alone = bool(self.suspects)
-        self.refill(range(self.world.corridors))
+        self.refill(range(self.simulation.corridors))
 
     def refill(self, corridors: Sequence[int]) -> None:
         """Begin the next episodes in corridors whose own have ended."""
@@ -203,7 +210,7 @@ class Rollout:
             return
         if self.alone:  # nothing else runs
             self.alone = bool(self.suspects)
-            corridors = range(self.world.corridors)
+            corridors = range(self.simulation.corridors)
         for corridor in corridors:
             self.active[corridor] = False
         for corridor in corridors:
@@ -229,23 +236,23 @@ class Rollout:
             self.merging.begin(corridor)
         if case is None:
             self.episodes[corridor] = None
-            self.world.park(corridor)
+            self.simulation.park(corridor)
             self.timeout_at[corridor] = NEVER
             return
         self.timeout_at[corridor] = self.row + case.scenario.max_steps
         self.episodes[corridor] = _Running(index, case, self.row)
-        self.world.place(corridor, case.starts(), own=case.level == OWN)
+        self.simulation.place(corridor, case.starts(), own=case.level == OWN)
         for car in range(len(self.mainline)):
-            self.pov.begin(car * self.world.corridors + corridor, case)
+            self.pov.begin(car * self.simulation.corridors + corridor, case)
         try:
             self.vut.begin(corridor, case)
-        except WRONGS as error:
+        except ANY_FAULT as error:
             said = f"reset raised {type(error).__name__}: {error}"
             self.errors[corridor] = End.VUT_ERROR, said
 
     def ask_drivers(self) -> FloatArray:
         """Return the accelerations of all vehicles, (A, K), within limits; write the record."""
-        x_m, v_mps, scenario = self.world.x_m, self.world.v_mps, self.world.scenario
+        x_m, v_mps, scenario = self.simulation.x_m, self.simulation.v_mps, self.simulation.scenario
         if not (np.isfinite(x_m).all() and np.isfinite(v_mps).all()):
             raise SimulationError("a position or a speed is not finite")
         merged = x_m[VUT] >= 0.0 if self.follow_steps else None
@@ -254,24 +261,24 @@ class Rollout:
         scene = Scene(self.active, self.step, x_m, v_mps, merged=merged)
         cars = self.pov.act(scene.of_mainline()).reshape(-1, x_m.shape[1])
         if self.has_traffic:
-            scene = scene._replace(facing=car_met(x_m, v_mps, scenario))
+            scene = scene._replace(conflicting=conflicting_car(x_m, v_mps, scenario))
         self.raised = None
         try:
             of_vut = np.asarray(self.vut.act(scene), dtype=np.float64)
             self.take_signals(of_vut)
-        except (SimulationError, VutLostError):
+        except (SimulationError, ControllerDiedError):
             raise
-        except WRONGS as error:
+        except ANY_FAULT as error:
             self.raised = f"{type(error).__name__}: {error}"
-            of_vut = np.full(self.world.corridors, np.nan)
+            of_vut = np.full(self.simulation.corridors, np.nan)
         answer = np.concatenate((cars[:VUT], of_vut[None], cars[VUT:]))
         # Before the limits of car following, which would turn an infinite answer into a number.
         if not np.isfinite(answer).all():
-            answer = self.only_numbers(answer)
+            answer = self.note_faults(answer)
         if self.has_traffic:
             keep_safe(answer, x_m, v_mps, scenario)
         if self.merging is not None:
-            self.merging.take(self.vut.wishes(), answer, x_m, v_mps)
+            self.merging.take(self.vut.merge_requests(), answer, x_m, v_mps)
         acceleration: FloatArray = np.clip(answer, scenario.a_min_mps2, scenario.a_max_mps2)
         acceleration[:, ~self.active] = 0.0
         self.now[..., 2] = acceleration.T
@@ -290,7 +297,7 @@ class Rollout:
             if left and episode is not None:
                 episode.left.append((self.row - 1 - episode.first_row, left))
 
-    def only_numbers(self, answer: FloatArray) -> FloatArray:
+    def note_faults(self, answer: FloatArray) -> FloatArray:
         """Return answers, (A, K), with 0 for those that are not finite; note the errors.
 
         The answers of a VUT that is driven for do not count.
@@ -304,7 +311,7 @@ class Rollout:
             if row == VUT:
                 error = End.VUT_ERROR, self.raised or self.vut.reason(corridor) or said
             else:
-                place = self.mainline.index(row) * self.world.corridors + corridor
+                place = self.mainline.index(row) * self.simulation.corridors + corridor
                 error = End.SIM_ERROR, OF_THE_POV + (self.pov.reason(place) or said)
             self.errors.setdefault(corridor, error)
         return np.where(finite, answer, 0.0)
@@ -326,8 +333,8 @@ class Rollout:
         rows = np.arange(episode.first_row, episode.first_row + length) % self.ring
         motion = self.record[corridor, rows]
         if error is None:
-            motion[-1, :, 0] = self.world.x_m[:, corridor]
-            motion[-1, :, 1] = self.world.v_mps[:, corridor]
+            motion[-1, :, 0] = self.simulation.x_m[:, corridor]
+            motion[-1, :, 1] = self.simulation.v_mps[:, corridor]
         motion[-1, :, 2] = 0.0
         # A vehicle that comes to a stand brakes only as hard as that takes.
         motion[:, :, 2] = np.maximum(motion[:, :, 2], motion[:, :, 1] / -DT_S)

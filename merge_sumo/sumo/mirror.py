@@ -68,7 +68,7 @@ class MirrorSimulation:
         at_m: positions of the vehicles on the road along their lanes, M = 0.
         departed: vehicles that departed since they were last read; and `arrived`.
         merged: whether the VUT has left the acceleration lane of a road with one.
-        wants_to_merge: whether SUMO has put the VUT on the mainline in its last step.
+        requests_merge: whether SUMO has put the VUT on the mainline in its last step.
         by_sumo: whether SUMO's own driver chose the speed of the VUT in it.
     """
 
@@ -84,7 +84,7 @@ class MirrorSimulation:
         self.at_m: dict[str, float] = {}
         self.departed: list[str] = []
         self.arrived: list[str] = []
-        self.merged = self.wants_to_merge = self.by_sumo = False
+        self.merged = self.requests_merge = self.by_sumo = False
         on_ramp = {piece.lane for piece in self.road.ramp.pieces}
         self._mainline = {piece.lane for piece in self.road.mainline.pieces} - on_ramp
         """Lanes of the mainline alone: there a VUT has left the acceleration lane."""
@@ -196,7 +196,7 @@ class MirrorSimulation:
         v_mps = float(vehicle.getSpeed(VUT_ID))
         on_mainline = self.has_lane and vehicle.getLaneID(VUT_ID) in self._mainline
         is_forced = self.has_lane and VUT_ID in moved
-        self.wants_to_merge = on_mainline and not is_forced
+        self.requests_merge = on_mainline and not is_forced
         own_mps = vehicle.getSpeedWithoutTraCI(VUT_ID)
         self.by_sumo = bool(own_mps == v_mps) and not is_forced
         return v_mps

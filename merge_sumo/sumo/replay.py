@@ -38,7 +38,7 @@ from merge_sumo.scenario.scenario import (
 )
 from merge_sumo.scenario.trajectory import Trajectory, cut_at
 from merge_sumo.sumo.binding import run_program, scratch_folder
-from merge_sumo.sumo.hosting import hosted_net
+from merge_sumo.sumo.net_copies import hosted_net
 from merge_sumo.sumo.replay_folder import (
     CASE,
     CONFIG,

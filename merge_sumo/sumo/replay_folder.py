@@ -30,7 +30,7 @@ from merge_sumo.road.xml_input import to_bytes
 from merge_sumo.scenario.case import Case, FloatArray, described
 from merge_sumo.scenario.scenario import DT_S, VEHICLES, VUT, Bounds, level_name, rgb
 from merge_sumo.scenario.trajectory import Trajectory
-from merge_sumo.sumo.hosting import COPY, LANE, hosted_net
+from merge_sumo.sumo.net_copies import COPY, LANE, hosted_net
 
 CONFIG = "replay.sumocfg"
 NET = "us23.net.xml"

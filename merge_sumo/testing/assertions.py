@@ -6,7 +6,7 @@ from merge_sumo import api
 from merge_sumo.analysis.counterfactuals import causes
 from merge_sumo.api import verb
 from merge_sumo.campaigns.again import again, command
-from merge_sumo.campaigns.run import failures
+from merge_sumo.campaigns.recorded import failures
 from merge_sumo.config import NoFailures
 from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.printable import printable
@@ -28,14 +28,14 @@ def assert_no_failures(config: NoFailures) -> CampaignRun:
 
 def _message(run: CampaignRun, seed: int) -> str | None:
     """Return the message of an assertion; None for a campaign without failures and errors."""
-    outcomes = run.run.cases
+    outcomes = run.recorded.cases
     failed = failures(outcomes)
     wrong = [*failed, *(outcome for outcome in outcomes if outcome.measures.end.is_error)]
     if run.verdict.tested and not wrong:
         return None
-    lines = [f"{run.run.vut}: {run.verdict.counts}, with seed {seed}"]
-    lines.append(f"  a case fails when {run.run.criterion.said(run.run.scenario)}")
-    lines += run.verdict.trouble_lines()
+    lines = [f"{run.recorded.vut}: {run.verdict.counts}, with seed {seed}"]
+    lines.append(f"  a case fails when {run.recorded.criterion.description(run.recorded.scenario)}")
+    lines += run.verdict.error_lines()
     if not run.verdict.tested:
         lines.append(f"  {run.verdict.nothing_tested}")
     if wrong:
@@ -48,7 +48,7 @@ def _worst(run: CampaignRun, outcome: Outcome, title: str) -> list[str]:
     case, index = outcome.case, outcome.index
     return [
         f"  {title}: case {index}, POV level {level_name(case.level)}, {described(case)}",
-        f"    {causes(run.run, [outcome])[index]}",
+        f"    {causes(run.recorded, [outcome])[index]}",
         f"    replay it: {command('replay', run.folder, index, gui=True)}",
         f"    run it again: {again('run', run.folder, run.settings, index)}",
     ]

@@ -20,7 +20,7 @@ import numpy as np
 from merge_sumo import api
 from merge_sumo.campaigns.campaign import run_campaign
 from merge_sumo.campaigns.plan import resolve
-from merge_sumo.campaigns.run import Run
+from merge_sumo.campaigns.recorded import RecordedCampaign
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.controllers.kinds import load
 from merge_sumo.files import ScratchFolder
@@ -96,7 +96,7 @@ _kept: list[ScratchFolder] = []
 
 
 @cache
-def campaign_of(vut: str = "level0", scenario: Scenario = US23) -> Run:
+def campaign_of(vut: str = "level0", scenario: Scenario = US23) -> RecordedCampaign:
     """Return a campaign in SUMO at level 0; its folder stays until the process ends."""
     scratch = ScratchFolder()
     _kept.append(scratch)
@@ -124,7 +124,7 @@ class VutContract:
     vut: str
     scenarios: tuple[str, ...] = ("us23", "us23-lane")
 
-    def runs(self) -> list[Run]:
+    def runs(self) -> list[RecordedCampaign]:
         """Return a campaign in each scenario."""
         return [campaign_of(self.vut, named_scenario(name)) for name in self.scenarios]
 

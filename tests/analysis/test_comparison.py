@@ -22,7 +22,7 @@ from merge_sumo.analysis.rerun import rerun
 from merge_sumo.analysis.run_study import RunStudy
 from merge_sumo.campaigns.journal import Journal
 from merge_sumo.campaigns.plan import resolve
-from merge_sumo.campaigns.run import Run
+from merge_sumo.campaigns.recorded import RecordedCampaign
 from merge_sumo.campaigns.settings import settings_of
 from merge_sumo.errors import UserError
 from merge_sumo.metrics.measures import Measures
@@ -64,17 +64,17 @@ def test_the_change_of_a_case(before, after, change, words):
     assert (one.change, change_in_words(one)) == (change, words)
 
 
-def changed(folder, run, **settings) -> Run:
+def changed(folder, run, **settings) -> RecordedCampaign:
     """Return a copy of a run with other settings."""
     folder.mkdir()
     for name in ("outcomes.jsonl", "campaign.json"):
         (folder / name).write_bytes((run.folder / name).read_bytes())
     record = {**run.record, **settings}
     (folder / "campaign.json").write_text(json.dumps(record))
-    return Run(folder)
+    return RecordedCampaign(folder)
 
 
-def write(folder: Path, *points: Point, level: int = 0, **settings: object) -> Run:
+def write(folder: Path, *points: Point, level: int = 0, **settings: object) -> RecordedCampaign:
     """Write a campaign with cases at points of the unit square that pass, fail or err."""
     record = {"vut": folder.name, "levels": [level], "sampler": "by hand", "cases": len(points)}
     journal = Journal.create(folder, record | settings)
@@ -88,7 +88,7 @@ def write(folder: Path, *points: Point, level: int = 0, **settings: object) -> R
             measures = Measures(**measures.values | {"end": End.MERGED, "score": score})
         ran.append(Episode(Outcome(index, 0, case, measures), trajectory))
     journal.append(ran)
-    return Run(folder)
+    return RecordedCampaign(folder)
 
 
 def test_shared_cases_are_paired_wherever_they_stand(tmp_path):

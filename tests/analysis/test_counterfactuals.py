@@ -16,7 +16,7 @@ from support.scenes import scene_of
 from merge_sumo.analysis.counterfactuals import AVOIDANCE, avoidance, avoidances
 from merge_sumo.analysis.run_study import RunStudy
 from merge_sumo.campaigns.plan import resolve
-from merge_sumo.campaigns.run import Run, failures
+from merge_sumo.campaigns.recorded import RecordedCampaign, failures
 from merge_sumo.campaigns.settings import CampaignSettings, controllers, settings_of
 from merge_sumo.controllers.spec import ControllerOptions
 from merge_sumo.drivers.policies import policies_of
@@ -124,9 +124,9 @@ def test_a_pov_of_the_user_drives_again_in_sumo(run, found, tmp_path):
 class TestTheFile:
     def test_is_read_as_it_was_written_and_leaves_the_outcomes_alone(self, folder, found):
         before = (folder / "outcomes.jsonl").read_bytes()
-        assert AVOIDANCE.read_lines(Run(folder)) == []
+        assert AVOIDANCE.read_lines(RecordedCampaign(folder)) == []
         AVOIDANCE.write_lines(folder, found)
-        assert AVOIDANCE.read_lines(Run(folder)) == found
+        assert AVOIDANCE.read_lines(RecordedCampaign(folder)) == found
         assert (folder / "outcomes.jsonl").read_bytes() == before
 
     @pytest.mark.parametrize(
@@ -140,4 +140,4 @@ class TestTheFile:
         lines[0] = json.dumps(json.loads(lines[0]) | change)
         path.write_text("\n".join(lines) + "\n")
         with pytest.raises(UserError, match=r"line 1 of .* is not as it was written"):
-            AVOIDANCE.read_lines(Run(folder))
+            AVOIDANCE.read_lines(RecordedCampaign(folder))

@@ -20,7 +20,7 @@ from merge_sumo.analysis.explanation import (
     Explanation,
     nearest,
 )
-from merge_sumo.campaigns.run import Run, failures
+from merge_sumo.campaigns.recorded import RecordedCampaign, failures
 from merge_sumo.controllers.kinds import load
 from merge_sumo.controllers.parameters import Range, values_of
 from merge_sumo.errors import UserError
@@ -31,7 +31,7 @@ from merge_sumo.simulation.evaluate import simulate
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
     folder = tmp_path_factory.mktemp("explained") / "run"
-    return ms.campaign("design2", cases=72, level="all", seed=1, out=folder, workers=1).run
+    return ms.campaign("design2", cases=72, level="all", seed=1, out=folder, workers=1).recorded
 
 
 @pytest.fixture
@@ -149,7 +149,9 @@ class TestParameters:
         other = ms.explain(folder, vut="design2?kp=1.3", params=["kp=1..1.41"])
         (of_kp,) = other.found.parameters
         assert (of_kp.value, of_kp.low, of_kp.high) == (1.3, 1.0, 1.41)
-        assert EXPLANATIONS.read_lines(Run(folder)) == [result.found, other.found], "one a VUT"
+        assert EXPLANATIONS.read_lines(RecordedCampaign(folder)) == [result.found, other.found], (
+            "one a VUT"
+        )
         assert (worst.index, other.found.vut) == (result.found.index, "design2?kp=1.3")
         page = ms.open_run(folder).report().read_text("utf-8")
         assert "the VUT's gap_m is 16.20; passes at" in page

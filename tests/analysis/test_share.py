@@ -118,7 +118,7 @@ def test_of_a_campaign_of_uniform_cases_is_that_of_its_own_cases(tmp_path):
     run = api.campaign(
         "sumo:IDM", sampler="uniform", level="0", cases=10, out=tmp_path / "run", progress=False
     )
-    failures = sum(outcome.failed for outcome in run.run.outcomes)
+    failures = sum(outcome.failed for outcome in run.recorded.outcomes)
     [level] = SHARES.read(run.folder).levels
     assert level == LevelShare(level=0, cases=10, failures=failures)
     said = f"  {level.shown} of all starts fail, by 10  "

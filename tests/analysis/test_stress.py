@@ -20,7 +20,7 @@ from merge_sumo.road.merge import road_for
 from merge_sumo.scenario.imperfection import Actuation
 from merge_sumo.scenario.scenario import US23
 from merge_sumo.scenario.trajectory import End
-from merge_sumo.simulation.kinematic_world import EquationWorld
+from merge_sumo.simulation.kinematic_simulation import KinematicSimulation
 
 FAIL_WHEN = "bumper_gap_m < 15"
 """Two fifths of the cases fail: no sampler need look for them."""
@@ -106,24 +106,24 @@ def test_flips_by_hand(run):
 def test_sumo_own_drivers_are_stressed_but_for_the_step(tmp_path):
     own = ms.campaign("sumo:Krauss", cases=4, level=0, sampler="uniform", out=tmp_path / "run")
     skipped = {one.name: one.skipped for one in ms.stress(own).rungs if one.skipped}
-    assert skipped == {"step": "sumo:Krauss drives in a SUMO world only"}
+    assert skipped == {"step": "sumo:Krauss drives in a SUMO simulation only"}
 
 
 class TestAShorterStep:
-    def world(self, x_vut_m=-10.0):
-        world = EquationWorld(1, road_for(US23), US23, substeps=5)
-        world.place(0, [(-50.0, 30.0), (x_vut_m, 20.0)])
-        return world
+    def simulation(self, x_vut_m=-10.0):
+        simulation = KinematicSimulation(1, road_for(US23), US23, substeps=5)
+        simulation.place(0, [(-50.0, 30.0), (x_vut_m, 20.0)])
+        return simulation
 
     def test_moves_by_eq_4_five_times(self):
-        world = self.world()
-        world.command(np.array([[0.0], [1.0]]))
+        simulation = self.simulation()
+        simulation.command(np.array([[0.0], [1.0]]))
         # 20 m/s for 0.02 s, then 20.02 m/s, ... 20.08 m/s.
-        assert world.x_m[:, 0] == pytest.approx([-47.0, -10.0 + 2.004], abs=1e-12)
-        assert world.v_mps[:, 0] == pytest.approx([30.0, 20.1], abs=1e-12)
+        assert simulation.x_m[:, 0] == pytest.approx([-47.0, -10.0 + 2.004], abs=1e-12)
+        assert simulation.v_mps[:, 0] == pytest.approx([30.0, 20.1], abs=1e-12)
 
     def test_ends_an_episode_in_the_part_in_which_the_vut_arrives(self):
-        world = self.world(-1.0)
-        world.command(np.zeros((2, 1)))
+        simulation = self.simulation(-1.0)
+        simulation.command(np.zeros((2, 1)))
         # After 0.06 s the VUT is at 0.2 m.
-        assert world.x_m[:, 0] == pytest.approx([-48.2, 0.2], abs=1e-12)
+        assert simulation.x_m[:, 0] == pytest.approx([-48.2, 0.2], abs=1e-12)

@@ -9,11 +9,11 @@ import sys
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
-from support.attacks import World
+from support.attacks import SumoSimulation
 from support.campaigning import campaign_settings, run_campaign
 from support.plans import plan_for
 
-from merge_sumo.campaigns.run import OUTCOMES, Run
+from merge_sumo.campaigns.recorded import OUTCOMES, RecordedCampaign
 from merge_sumo.errors import UserError
 from merge_sumo.simulation.simulator import Simulator
 
@@ -26,49 +26,51 @@ NASTY = "a%41 b,c\n$(id)'\"\\ \x1b[31m日é" + os.fsdecode(b"\xff")
 
 
 @pytest.fixture
-def world(run, tmp_path):
+def simulation(run, tmp_path):
     shutil.copytree(run.folder, tmp_path / "run")
-    return World(tmp_path)
+    return SumoSimulation(tmp_path)
 
 
-def shell(world: World, command: str, streams: str = "", before: str = "") -> tuple[int, str, str]:
+def shell(
+    simulation: SumoSimulation, command: str, streams: str = "", before: str = ""
+) -> tuple[int, str, str]:
     """Run a command of merge-sumo by a shell."""
     run = f"{shlex.quote(sys.executable)} -m merge_sumo.cli {command} {streams}"
-    return World(world.root, prefix=("bash", "-c", f"{before}\n{run}\nexit $?")).run()
+    return SumoSimulation(simulation.root, prefix=("bash", "-c", f"{before}\n{run}\nexit $?")).run()
 
 
 @pytest.mark.slow
-def test_streams_that_are_closed_or_full_change_nothing_else(world):
-    code, out, _ = shell(world, COMPARE)
+def test_streams_that_are_closed_or_full_change_nothing_else(simulation):
+    code, out, _ = shell(simulation, COMPARE)
     assert (code, bool(out)) == (0, True)
     for streams in ("<&-", "<&- >&- 2>&-", "2> /dev/full"):
-        found, said, errors = shell(world, COMPARE, streams)
+        found, said, errors = shell(simulation, COMPARE, streams)
         assert found == code, (streams, errors)
         assert said == ("" if ">&-" in streams.split() else out)
-    found, _, errors = shell(world, COMPARE, "> /dev/full")
+    found, _, errors = shell(simulation, COMPARE, "> /dev/full")
     assert found == 2
     assert errors.endswith("cannot write the result to standard output: No space left on device\n")
 
 
-def test_a_reader_that_has_gone_ends_a_command_as_it_ends_others(world):
-    code, _, errors = shell(world, "scenario list", "| true; exit ${PIPESTATUS[0]}")
+def test_a_reader_that_has_gone_ends_a_command_as_it_ends_others(simulation):
+    code, _, errors = shell(simulation, "scenario list", "| true; exit ${PIPESTATUS[0]}")
     assert (code, errors) in ((128 + 13, ""), (0, ""))  # it may have been faster
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("limit", ["-f 1", "-n 12", "-v 1000000"])
-def test_under_a_limit_a_campaign_ends_in_a_sentence_or_as_without(world, limit):
-    code, _, errors = shell(world, f"{CAMPAIGN} --out new", before=f"ulimit {limit}")
+def test_under_a_limit_a_campaign_ends_in_a_sentence_or_as_without(simulation, limit):
+    code, _, errors = shell(simulation, f"{CAMPAIGN} --out new", before=f"ulimit {limit}")
     assert "Traceback" not in errors
     assert code == 0 or (code == 2 and errors.splitlines()[-1].startswith("merge-sumo: "))
-    assert not [n for n in world.left_in_temporary() if not n.startswith("merge-sumo")]
+    assert not [n for n in simulation.left_in_temporary() if not n.startswith("merge-sumo")]
 
 
 @pytest.mark.slow
-def test_a_terminal_of_ascii_shows_results_in_a_folder_of_any_name(world):
-    (world.root / "run").rename(world.root / NASTY)
+def test_a_terminal_of_ascii_shows_results_in_a_folder_of_any_name(simulation):
+    (simulation.root / "run").rename(simulation.root / NASTY)
     ascii_only = "export LC_ALL=C PYTHONIOENCODING=ascii:strict"
-    code, out, err = shell(world, "compare *31m* *31m*", "", ascii_only)
+    code, out, err = shell(simulation, "compare *31m* *31m*", "", ascii_only)
     assert (code, err) == (0, "")
     assert "\x1b" not in out
     assert "\\x1b[31m" in out
@@ -89,14 +91,14 @@ class TestAFolderThatVanishes:
         with pytest.raises(UserError, match=r"cannot write .*No such file or directory"):
             run_campaign(SETTINGS, tmp_path / "above" / "run", on_case=remove)
         if gone.endswith("trajectories"):
-            assert len(Run(tmp_path / "above" / "run").outcomes) == 20
+            assert len(RecordedCampaign(tmp_path / "above" / "run").outcomes) == 20
 
-    def test_in_which_one_works_is_named(self, world):
+    def test_in_which_one_works_is_named(self, simulation):
         script = (
             "import os, sys; os.mkdir('here'); os.chdir('here'); os.rmdir('../here');"
             "from merge_sumo.cli import main; sys.argv[0] = 'merge-sumo'; main()"
         )
-        code, _, err = world.run(*CAMPAIGN.split(), "--out", "new", script=script)
+        code, _, err = simulation.run(*CAMPAIGN.split(), "--out", "new", script=script)
         assert (code, "Traceback" in err) == (2, False), err
 
     def test_for_temporary_files_is_named(self, tmp_path, monkeypatch):

@@ -16,7 +16,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from merge_sumo.campaigns.run import OUTCOMES, SETTINGS, TRAJECTORIES, Run
+from merge_sumo.campaigns.recorded import OUTCOMES, SETTINGS, TRAJECTORIES, RecordedCampaign
 from merge_sumo.campaigns.settings import settings_of
 from merge_sumo.drivers.policies import load_network, read_manifest
 from merge_sumo.errors import UserError
@@ -24,7 +24,7 @@ from merge_sumo.files import resource
 from merge_sumo.reports.report import write_report
 from merge_sumo.road.merge import default_net_path, road_of
 from merge_sumo.sumo import replay
-from merge_sumo.sumo.hosting import hosted_net
+from merge_sumo.sumo.net_copies import hosted_net
 from merge_sumo.sumo.replay_folder import CASE, RECORD
 
 HARSH = [
@@ -53,7 +53,7 @@ def spoilt(draw: Any, original: bytes) -> bytes:
 
 
 def read_settings(folder: Path) -> None:
-    run = Run(folder)
+    run = RecordedCampaign(folder)
     settings_of(run.folder, run.record)
 
 
@@ -64,9 +64,9 @@ def read_policies(folder: Path) -> None:
 
 READERS: list[tuple[str, str, Callable[[Path], object]]] = [
     ("run", SETTINGS, read_settings),
-    ("run", SETTINGS, lambda folder: write_report(Run(folder))),
-    ("run", OUTCOMES, lambda folder: write_report(Run(folder))),
-    ("run", f"{TRAJECTORIES}/00000.npz", lambda folder: Run(folder).trajectory(0)),
+    ("run", SETTINGS, lambda folder: write_report(RecordedCampaign(folder))),
+    ("run", OUTCOMES, lambda folder: write_report(RecordedCampaign(folder))),
+    ("run", f"{TRAJECTORIES}/00000.npz", lambda folder: RecordedCampaign(folder).trajectory(0)),
     ("policies", "manifest.json", read_policies),
     ("policies", "pov1.safetensors", read_policies),
     ("replay", RECORD, replay._read),
@@ -77,7 +77,7 @@ READERS: list[tuple[str, str, Callable[[Path], object]]] = [
 
 
 @pytest.fixture(scope="module")
-def written(run: Run, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def written(run: RecordedCampaign, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a folder of files that merge-sumo wrote."""
     folder = tmp_path_factory.mktemp("written")
     shutil.copytree(run.folder, folder / "run")

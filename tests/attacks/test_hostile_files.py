@@ -21,7 +21,7 @@ from support.writers import tree
 
 import merge_sumo as ms
 from merge_sumo.analysis.truth import ground_truth, read_truth
-from merge_sumo.campaigns.run import OUTCOMES, SETTINGS, TRAJECTORIES
+from merge_sumo.campaigns.recorded import OUTCOMES, SETTINGS, TRAJECTORIES
 from merge_sumo.errors import UserError
 from merge_sumo.road import xml_input
 from merge_sumo.road.merge import default_net_path, road_of
@@ -32,7 +32,7 @@ from merge_sumo.sumo.binding import run_program
 from merge_sumo.sumo.opendrive import opendrive
 from merge_sumo.sumo.replay import replay
 from merge_sumo.sumo.replay_folder import CASE, CONFIG, HOSTED_NET, RECORD
-from merge_sumo.sumo.world import World
+from merge_sumo.sumo.sumo_simulation import SumoSimulation
 
 HONEST = Path(__file__).resolve().parents[2] / "scenarios" / "roundabout-yields"
 LIMIT_S = 20.0
@@ -50,8 +50,8 @@ def play(root: Path) -> str:
 def host(root: Path) -> str:
     """Use a net with every kind of controller and in an export; return the files made of it."""
     road = road_of(root / "sent" / "net.xml")
-    with World(1, road, scenario=US23) as world:
-        world.advance()
+    with SumoSimulation(1, road, scenario=US23) as simulation:
+        simulation.advance()
     with tempfile.TemporaryDirectory() as folder:
         mirror.write_files(Path(folder), road, US23)
         mirrored = (Path(folder) / mirror.NET).read_text()

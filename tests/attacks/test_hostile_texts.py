@@ -14,7 +14,7 @@ from support.handmade import write_run
 
 import merge_sumo as ms
 from merge_sumo.api import open_run
-from merge_sumo.campaigns.run import OUTCOMES, SETTINGS, read_settings
+from merge_sumo.campaigns.recorded import OUTCOMES, SETTINGS, read_settings
 from merge_sumo.controllers.process import LOG
 from merge_sumo.metrics.merge import Severity
 from merge_sumo.reports.junit import write_junit
@@ -73,6 +73,6 @@ def test_a_text_of_another_user_stays_a_text(call, name, honest, tmp_path):
     assert len(written) == 2, "as recorded, and with a free ego"
     assert {etree.parse(file).getroot().tag for file in written} == {"OpenSCENARIO"}
     opened = open_run(folder)
-    write_junit(tmp_path / "junit.xml", opened.run, opened.facts, opened.verdict, [])
+    write_junit(tmp_path / "junit.xml", opened.recorded, opened.facts, opened.verdict, [])
     assert etree.parse(tmp_path / "junit.xml").getroot().tag == "testsuites"
     assert "<script" not in opened._repr_html_() + opened.errors._repr_html_()

@@ -20,7 +20,7 @@ import merge_sumo as ms
 from merge_sumo import files
 from merge_sumo.analysis.counterfactuals import AVOIDANCE, Avoidance
 from merge_sumo.campaigns.campaign import SCENARIOS, case_name
-from merge_sumo.campaigns.run import OUTCOMES, SETTINGS, TRAJECTORIES
+from merge_sumo.campaigns.recorded import OUTCOMES, SETTINGS, TRAJECTORIES
 from merge_sumo.errors import UserError
 from merge_sumo.printable import printable, quoted
 from merge_sumo.road.merge import default_net_path
@@ -49,9 +49,9 @@ def no_cases(monkeypatch) -> None:
 
 
 @pytest.fixture
-def world(run, tmp_path, monkeypatch) -> Path:
+def simulation(run, tmp_path, monkeypatch) -> Path:
     """Return a folder with a run, a net and things of another user, in which commands start."""
-    here = tmp_path / "world" / "deep" / "cwd"
+    here = tmp_path / "simulation" / "deep" / "cwd"
     (here / "theirs").mkdir(parents=True)
     shutil.copytree(run.folder, here / "run")
     shutil.copy(default_net_path(), here / "us23.net.xml")
@@ -72,15 +72,15 @@ def remove(path: Path) -> None:
 
 
 @pytest.mark.parametrize("writer", WRITERS)
-def test_nothing_at_the_place_of_an_output_is_touched(world, no_cases, command_line, writer):
+def test_nothing_at_the_place_of_an_output_is_touched(simulation, no_cases, command_line, writer):
     command, suffix = WRITERS[writer]
-    words, there = shlex.split(command), world / f"there{suffix}"
-    before = tree(world)
+    words, there = shlex.split(command), simulation / f"there{suffix}"
+    before = tree(simulation)
     for name, make in PLACES.items():
         make(there)
-        planted = tree(world)
+        planted = tree(simulation)
         said = command_line(*words, there.name)
-        after = tree(world)
+        after = tree(simulation)
         assert planted.items() <= after.items(), name
         adds = writer in INTO_FOLDERS or (writer, name) == ("train", "an empty folder")
         if adds and there.is_dir():
@@ -98,17 +98,17 @@ def test_nothing_at_the_place_of_an_output_is_touched(world, no_cases, command_l
         assert_refused(command_line(*words, name), f"end it in {suffix}")
     for name in (*REFUSED, *TOO_LONG):
         assert_refused(command_line(*words, name))
-    assert tree(world) == before
+    assert tree(simulation) == before
 
 
 @pytest.mark.parametrize("name", some(ODD, "$(id)", "-rf", "\x1b[31mred", "日本", "new/sub"))
-def test_an_odd_name_is_a_name(world, command_line, name):
-    before = tree(world)
+def test_an_odd_name_is_a_name(simulation, command_line, name):
+    before = tree(simulation)
     code, _, err = command_line("export", "run", 0, f"--out={name}")
     assert code == 0, err
-    after = tree(world)
+    after = tree(simulation)
     assert before.items() <= after.items()
-    assert str(world / name / case_name(0) / "replay.sumocfg") in after
+    assert str(simulation / name / case_name(0) / "replay.sumocfg") in after
     assert not [path for path in after if files.TEMPORARY in path]
 
 
@@ -226,30 +226,30 @@ class TestARunFolderOfOthers:
             (f"{TRAJECTORIES}/00002.npz", linked_elsewhere),
         ],
     )
-    def test_with_a_link_is_not_resumed(self, world, no_cases, name, make):
-        folder = world / "run"
+    def test_with_a_link_is_not_resumed(self, simulation, no_cases, name, make):
+        folder = simulation / "run"
         lines = (folder / OUTCOMES).read_bytes().splitlines(keepends=True)
         (folder / OUTCOMES).write_bytes(b"".join(lines[:20]))
         make(folder / name)
-        before = tree(world)
+        before = tree(simulation)
         with pytest.raises(UserError, match=f"{Path(name).name}: it is a link"):
             resume_campaign(folder)
-        assert tree(world) == before
+        assert tree(simulation) == before
 
     @pytest.mark.parametrize("kind", THEIRS)
     @pytest.mark.parametrize("name", OURS)
-    def test_keeps_their_files_in_every_place(self, world, no_cases, name, kind):
-        path = world / "run" / name
+    def test_keeps_their_files_in_every_place(self, simulation, no_cases, name, kind):
+        path = simulation / "run" / name
         remove(path)
         THEIRS[kind](path)
-        before = tree(world)
+        before = tree(simulation)
         if name in ("scenarios", "exports") and path.is_dir():
-            OURS[name](world / "run")
-            assert before.items() <= tree(world).items()
+            OURS[name](simulation / "run")
+            assert before.items() <= tree(simulation).items()
         else:
             with pytest.raises(UserError, match=name):
-                OURS[name](world / "run")
-            assert tree(world) == before
+                OURS[name](simulation / "run")
+            assert tree(simulation) == before
 
 
 def test_the_link_to_the_newest_run_moves_to_newer_dated_runs_only(tmp_path, monkeypatch):

@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 from support.campaigning import campaign_settings, resume_campaign, run_campaign
 
 from merge_sumo.analysis.comparison import Change, compare_against
-from merge_sumo.campaigns.run import AGAINST, OUTCOMES, Run
+from merge_sumo.campaigns.recorded import AGAINST, OUTCOMES, RecordedCampaign
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.errors import UserError
 from merge_sumo.metrics.fmc import RADIUS
@@ -124,7 +124,9 @@ def test_gate_and_page_name_what_broke(call):
     assert said.code == 1
     rows = json.loads(said.out)["against"]["transitions"]
     count = sum(row["cases"] for row in rows if row["change"] == "broke")
-    assert count == sum(broke(outcome.case) for outcome in Run(Path("run")).outcomes) > 0
+    assert (
+        count == sum(broke(outcome.case) for outcome in RecordedCampaign(Path("run")).outcomes) > 0
+    )
     assert f"gate regressions: met ({count} regression" in said.err
     assert f'<h2 id="change-1-1">Broke: {count}</h2>' in Path("run/against.html").read_text()
     assert "against.html" in Path("run/report.html").read_text()
@@ -137,7 +139,7 @@ def test_a_case_that_passed_and_ends_with_an_error_broke(command_line):
     asked = ("--vut", "new.py:f", "--against", "old.py:f", "--level", 0, "--cases", 10, "--quiet")
     code, out, err = command_line("campaign", *asked, "--out", "run")
     assert code == 0, err
-    errors = sum(o.measures.end.is_error for o in Run(Path("run")).outcomes)
+    errors = sum(o.measures.end.is_error for o in RecordedCampaign(Path("run")).outcomes)
     assert 0 < errors < 10
     assert re.search(rf"against old.py:f: .* of 10 shared cases {errors} broke", out)
     assert re.search(r"safe -> vut error \(broke\)", out)

@@ -15,7 +15,7 @@ import pytest
 from support.handmade import FOLLOWED_UP
 
 from merge_sumo.campaigns.journal import Journal, to_line
-from merge_sumo.campaigns.run import Run, read_outcomes, read_settings
+from merge_sumo.campaigns.recorded import RecordedCampaign, read_outcomes, read_settings
 from merge_sumo.errors import UserError
 from merge_sumo.metrics.measures import OURS, Measures
 from merge_sumo.metrics.outcome import Episode, Outcome
@@ -101,7 +101,7 @@ class TestAJournal:
         ran = [episode(index, batch=index // 2, steps=20 + 7 * index) for index in range(5)]
         for batch in range(3):
             journal.append([one for one in ran if one.outcome.batch == batch])
-        run = Run(tmp_path / "run")
+        run = RecordedCampaign(tmp_path / "run")
         assert run.record == settings
         assert run.outcomes == [one.outcome for one in ran]
         for index in (4, 0, 3, 1, 2):
@@ -158,7 +158,7 @@ class TestAJournal:
             assert (written < most) == (most == 12_000), "the outcomes are the larger file"
             assert (tmp_path / "run" / "outcomes.jsonl").read_bytes() == before
             journal.append(batch)
-        assert len(Run(tmp_path / "run").outcomes) == 41
+        assert len(RecordedCampaign(tmp_path / "run").outcomes) == 41
 
 
 class TestARun:
@@ -177,18 +177,18 @@ class TestARun:
 
     def test_without_one_of_its_files_says_so(self, folder):
         (folder / "trajectories" / "00001.npz").unlink()
-        run = Run(folder)
+        run = RecordedCampaign(folder)
         assert len(run.trajectory(0).motion) == 61
         with pytest.raises(UserError, match=r"00001\.npz"):
             run.trajectory(2)
         for name in ("outcomes.jsonl", "campaign.json"):
             (folder / name).unlink()
             with pytest.raises(UserError, match=f"not a campaign.*{name}"):
-                Run(folder)
+                RecordedCampaign(folder)
 
     def test_runs_no_code_that_hides_in_trajectories(self, folder):
         path = folder / "trajectories" / "00000.npz"
         hidden = np.array([Path(folder)], dtype=object)  # which is read by unpickling alone
         np.savez(path, index=np.array([0, 1]), rows=np.array([1, 1]), motion=hidden)
         with pytest.raises(UserError, match=r"00000\.npz"):
-            Run(folder).trajectory(0)
+            RecordedCampaign(folder).trajectory(0)

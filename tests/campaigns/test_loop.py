@@ -15,7 +15,7 @@ from support.plans import plan_for
 
 from merge_sumo.campaigns.journal import to_line
 from merge_sumo.campaigns.loop import AGE, GROUPS, SearchLoop
-from merge_sumo.campaigns.run import OUTCOMES, TRAJECTORIES
+from merge_sumo.campaigns.recorded import OUTCOMES, TRAJECTORIES
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.errors import UserError
 from merge_sumo.metrics.criterion import PAPER_CRITERION

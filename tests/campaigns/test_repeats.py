@@ -7,6 +7,7 @@ from support.calling import invoke
 from support.campaigning import campaign_settings
 
 import merge_sumo as ms
+from merge_sumo.campaigns.recorded import RecordedCampaign
 from merge_sumo.campaigns.repeats import (
     REPEATS,
     Repeat,
@@ -14,7 +15,6 @@ from merge_sumo.campaigns.repeats import (
     read_repeats,
     unrepeatable,
 )
-from merge_sumo.campaigns.run import Run
 from merge_sumo.errors import UserError
 from merge_sumo.records import to_json
 from merge_sumo.reports.report import write_report
@@ -39,7 +39,7 @@ def test_a_controller_that_remembers_is_named_everywhere(write_vut, tmp_path):
     words = ("campaign", "--vut", spec, "--level", 0, "--cases", 60, "--sampler", "uniform")
     done = invoke(*words, "--out", folder, "-q")
     assert done.stdout.startswith("Not repeatable: ")
-    run = Run(folder)
+    run = RecordedCampaign(folder)
     assert len(run.outcomes) == 60
     repeats = read_repeats(run)
     assert len(repeats) == 8
@@ -71,7 +71,7 @@ def test_drivers_of_the_package_and_clients_that_a_user_starts_run_once(run):
 def test_a_changed_file_is_refused_by_its_line(run, tmp_path):
     for name in ("campaign.json", "outcomes.jsonl"):
         (tmp_path / name).write_bytes((run.folder / name).read_bytes())
-    opened, repeat = Run(tmp_path), Repeat(3, 1.5, "vut", End.MERGED, False, True)
+    opened, repeat = RecordedCampaign(tmp_path), Repeat(3, 1.5, "vut", End.MERGED, False, True)
     line = to_json(repeat)
     (tmp_path / REPEATS).write_bytes(line)
     assert read_repeats(opened) == [repeat]

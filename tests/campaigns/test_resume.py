@@ -18,7 +18,7 @@ from support.campaigning import campaign_settings, resume_campaign, run_campaign
 
 from merge_sumo import interrupt
 from merge_sumo.campaigns.journal import Journal
-from merge_sumo.campaigns.run import OUTCOMES, SETTINGS, TRAJECTORIES, Run
+from merge_sumo.campaigns.recorded import OUTCOMES, SETTINGS, TRAJECTORIES, RecordedCampaign
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.errors import Notice, UserError
 from merge_sumo.interrupt import Interrupt, Stopped
@@ -74,14 +74,17 @@ def folder(two_batches, tmp_path) -> Path:
 class TestResuming:
     def test_gives_the_same_bytes_and_files(self, whole, folder):
         assert outcomes(whole).startswith(outcomes(folder))
-        assert len(Run(folder).outcomes) == 2 * BATCH
+        assert len(RecordedCampaign(folder).outcomes) == 2 * BATCH
         run = resume_campaign(folder)
         assert outcomes(folder) == outcomes(whole)
         assert len(run.outcomes) == 28
         names = {path.relative_to(folder) for path in folder.rglob("*")}
         assert names == {path.relative_to(whole) for path in whole.rglob("*")}
         assert (folder / SETTINGS).read_bytes() == (whole / SETTINGS).read_bytes()
-        assert run.trajectory(27).motion.tobytes() == Run(whole).trajectory(27).motion.tobytes()
+        assert (
+            run.trajectory(27).motion.tobytes()
+            == RecordedCampaign(whole).trajectory(27).motion.tobytes()
+        )
 
     @pytest.mark.parametrize("kept", ["all but a byte", "15 lines", "4 lines", "no motion"])
     def test_drops_what_was_not_written_to_its_end_and_says_so(self, whole, folder, kept):
@@ -187,7 +190,7 @@ class TestADisk:
         with pytest.raises(UserError, match=r"cannot write .*Read-only file system"):
             run_campaign(settings(), small_disk / "another")
         assert contents(run) == before
-        assert len(Run(run).outcomes) == 2 * BATCH, "it can still be read"
+        assert len(RecordedCampaign(run).outcomes) == 2 * BATCH, "it can still be read"
 
 
 class TestASignal:

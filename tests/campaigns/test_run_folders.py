@@ -15,7 +15,7 @@ from support.calling import assert_refused
 from support.campaigning import campaign_settings, run_campaign
 
 from merge_sumo.campaigns.again import again
-from merge_sumo.campaigns.run import OUTCOMES, Run, read_settings
+from merge_sumo.campaigns.recorded import OUTCOMES, RecordedCampaign, read_settings
 from merge_sumo.controllers.in_memory import names_code
 from merge_sumo.controllers.kinds import load
 from merge_sumo.errors import UserError
@@ -135,7 +135,7 @@ class TestAChangedController:
         assert (code, err) == (0, "")
 
     def test_is_known_by_its_files_wherever_they_are(self, mine, tmp_path):
-        recorded = Run(mine / "run").record["vut_files"]
+        recorded = RecordedCampaign(mine / "run").record["vut_files"]
         assert set(recorded) == {"my_vut.py", "helper.py"}
         there = project(tmp_path / "there")
         loaded = {str(there / "my_vut.py"): recorded["my_vut.py"]}

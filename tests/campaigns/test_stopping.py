@@ -8,8 +8,8 @@ import pytest
 from support.campaigning import run_campaign
 
 from merge_sumo import api
-from merge_sumo.campaigns import run as campaign_folder
-from merge_sumo.campaigns.run import WINDOW, has_converged
+from merge_sumo.campaigns import recorded as campaign_folder
+from merge_sumo.campaigns.recorded import WINDOW, has_converged
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.metrics.measures import Measures
 from merge_sumo.metrics.outcome import Outcome
@@ -63,13 +63,14 @@ def test_without_a_number_of_cases_a_campaign_ends_when_it_has_converged_and_may
     plan: dict[str, Any] = {"level": 0, "sampler": "annealing", "progress": False}
     run = api.campaign("design1", **plan, out=tmp_path / "run")
     assert run.converged
-    assert 20 < len(run.run.outcomes) < 800
-    assert run.lines()[0].endswith(f"; {len(run.run.outcomes)} of 800 cases, converged")
-    more = api.resume(run, cases=len(run.run.outcomes) + 40, progress=False)
+    assert 20 < len(run.recorded.outcomes) < 800
+    assert run.lines()[0].endswith(f"; {len(run.recorded.outcomes)} of 800 cases, converged")
+    more = api.resume(run, cases=len(run.recorded.outcomes) + 40, progress=False)
     assert not more.converged
-    assert len(more.run.outcomes) == len(run.run.outcomes) + 40
+    assert len(more.recorded.outcomes) == len(run.recorded.outcomes) + 40
+    total = len(more.recorded.outcomes)
     settings = CampaignSettings(
-        vut="design1", levels=(0,), sampler="annealing", cases=len(more.run.outcomes), scenario=US23
+        vut="design1", levels=(0,), sampler="annealing", cases=total, scenario=US23
     )
     whole = run_campaign(settings, tmp_path / "whole")
     texts = [(one.folder / "outcomes.jsonl").read_bytes() for one in (more, whole)]

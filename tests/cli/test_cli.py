@@ -14,7 +14,7 @@ from lxml import etree
 from support.calling import Said, assert_refused, commands, contents, invoke, run_in_a_process
 
 from merge_sumo.analysis.reproduction import TABLE_II, Scale
-from merge_sumo.campaigns.run import Run, failures, spread_failures
+from merge_sumo.campaigns.recorded import RecordedCampaign, failures, spread_failures
 from merge_sumo.sumo.binding import DEBIAN_PACKAGES
 from merge_sumo.sumo.replay_folder import RECORD
 
@@ -111,7 +111,7 @@ class TestACampaign:
     def test_finds_failures_and_writes_a_line_per_case(self, ended):
         folder, said = ended
         assert said.code == 0, said.err
-        run = Run(folder / "run")
+        run = RecordedCampaign(folder / "run")
         assert len(run.outcomes) == 80
         assert (folder / "run" / "outcomes.jsonl").read_bytes().count(b"\n") == 80
         assert failures(run.outcomes)
@@ -121,7 +121,7 @@ class TestACampaign:
         folder, said = ended
         assert said.out.count("\n") == 1
         summary = json.loads(said.out)
-        found = len(failures(Run(folder / "run").outcomes))
+        found = len(failures(RecordedCampaign(folder / "run").outcomes))
         assert (summary["cases"], summary["failures"]) == (80, found)
         assert summary["levels"]["0"]["failures"] == found
         # One ball of radius 0.05 has 0.00785.
@@ -131,7 +131,7 @@ class TestACampaign:
 
     def test_exports_its_worst_failures_as_scenarios_that_replay_identically(self, ended, call):
         folder, _ = ended
-        worst = spread_failures(Run(folder / "run").outcomes)[:10]
+        worst = spread_failures(RecordedCampaign(folder / "run").outcomes)[:10]
         names = {f"case-{outcome.index:05d}" for outcome in worst}
         assert {path.name for path in (folder / "run" / "scenarios").iterdir()} == names
         for name in sorted(names)[:3]:

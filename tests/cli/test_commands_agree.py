@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 import merge_sumo as ms
-from merge_sumo.campaigns.run import OUTCOMES
+from merge_sumo.campaigns.recorded import OUTCOMES
 from merge_sumo.metrics.criterion import Criterion
 from merge_sumo.metrics.fmc import fmc
 from merge_sumo.scenario.case import Case, Pool
@@ -38,7 +38,7 @@ OF_A_CASE = (
 )
 
 
-class World:
+class SumoSimulation:
     """The command line in a folder of its own, with a campaign in it."""
 
     def __init__(self, main: Any) -> None:
@@ -61,9 +61,9 @@ class World:
 
     @property
     def scenario(self) -> Scenario:
-        return ms.open_run("run").run.scenario
+        return ms.open_run("run").recorded.scenario
 
-    def judged(self, case: Case) -> bool:
+    def bare_outcome(self, case: Case) -> bool:
         """Return whether a case fails when it is run alone."""
         at = {name: x for name in OF_A_CASE if (x := getattr(case, name)) is not None}
         found = ms.run(VUT, level=LEVEL, scenario=self.scenario, at=at)
@@ -79,60 +79,60 @@ def fails(record: dict[str, Any]) -> bool:
 
 
 @pytest.fixture
-def world(monkeypatch, tmp_path, command_line) -> World:
+def simulation(monkeypatch, tmp_path, command_line) -> SumoSimulation:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("MERGE_SUMO_CACHE", str(tmp_path / "cache"))
-    return World(command_line)
+    return SumoSimulation(command_line)
 
 
 @pytest.mark.slow
-def test_every_command_judges_a_case_alike(world: World):
-    records = world.records
+def test_every_command_judges_a_case_alike(simulation: SumoSimulation):
+    records = simulation.records
     assert 0 < sum(map(fails, records)) < CASES, "else nothing is told apart"
-    assert world.campaign["levels"][str(LEVEL)]["failures"] == sum(map(fails, records))
-    run_judges_as_the_campaign(world, records)
-    rerun_changes_nothing(world)
-    truth_judges_as_run(world)
-    probability_judges_as_run(world)
-    resume_goes_on_alike(world, records)
+    assert simulation.campaign["levels"][str(LEVEL)]["failures"] == sum(map(fails, records))
+    run_judges_as_the_campaign(simulation, records)
+    rerun_changes_nothing(simulation)
+    truth_judges_as_run(simulation)
+    probability_judges_as_run(simulation)
+    resume_goes_on_alike(simulation, records)
 
 
-def run_judges_as_the_campaign(world: World, records: list[dict[str, Any]]) -> None:
+def run_judges_as_the_campaign(simulation: SumoSimulation, records: list[dict[str, Any]]) -> None:
     told = [next(r for r in records if fails(r) is failing) for failing in (True, False)]
     for record in told:
-        (again,) = world("run", "--case", "run", record["index"], codes=(0, 1))
+        (again,) = simulation("run", "--case", "run", record["index"], codes=(0, 1))
         for name in ("motion", "index", "batch", "foretold"):
             again.pop(name, None)
         assert again == {k: v for k, v in record.items() if k in again}
         assert again["margin"] == record["margin"]
 
 
-def rerun_changes_nothing(world: World) -> None:
-    (again,) = world("rerun", "run")
+def rerun_changes_nothing(simulation: SumoSimulation) -> None:
+    (again,) = simulation("rerun", "run")
     (step,) = again["steps"]
     assert sum(row["cases"] for row in step["transitions"]) == CASES
     assert {case["change"] for case in step["cases"]} <= {"pass with neither"}
     assert again["worse"] is False
 
 
-def truth_judges_as_run(world: World) -> None:
-    (truth,) = world("truth", *ASKED, "--cases", 10, "--workers", 1)
-    dims = len(world.scenario.dimensions(LEVEL))
+def truth_judges_as_run(simulation: SumoSimulation) -> None:
+    (truth,) = simulation("truth", *ASKED, "--cases", 10, "--workers", 1)
+    dims = len(simulation.scenario.dimensions(LEVEL))
     points = np.random.default_rng([0, LEVEL]).random((10, dims))
-    cases = Pool(levels=(LEVEL,), scenario=world.scenario).cases(points, LEVEL)
-    failing = np.array([world.judged(case) for case in cases])
+    cases = Pool(levels=(LEVEL,), scenario=simulation.scenario).cases(points, LEVEL)
+    failing = np.array([simulation.bare_outcome(case) for case in cases])
     assert (truth["failures"], truth["fmc"]) == (failing.sum(), fmc(points[failing]))
 
 
-def probability_judges_as_run(world: World) -> None:
-    (found,) = world("probability", "run", "--cases", 60)
+def probability_judges_as_run(simulation: SumoSimulation) -> None:
+    (found,) = simulation("probability", "run", "--cases", 60)
     assert found["missed"], "else nothing is told apart"
     for given in found["missed"][:3]:
-        fixed = {"v_vut0_mps": world.scenario.bounds("v_vut0_mps")[0]}
-        assert world.judged(Case(scenario=world.scenario, **{**fixed, **given}))
+        fixed = {"v_vut0_mps": simulation.scenario.bounds("v_vut0_mps")[0]}
+        assert simulation.bare_outcome(Case(scenario=simulation.scenario, **{**fixed, **given}))
 
 
-def resume_goes_on_alike(world: World, records: list[dict[str, Any]]) -> None:
-    world("campaign", "--resume", "run", "--cases", CASES + 6)
-    assert world.records[:CASES] == records
-    assert len(world.records) == CASES + 6
+def resume_goes_on_alike(simulation: SumoSimulation, records: list[dict[str, Any]]) -> None:
+    simulation("campaign", "--resume", "run", "--cases", CASES + 6)
+    assert simulation.records[:CASES] == records
+    assert len(simulation.records) == CASES + 6

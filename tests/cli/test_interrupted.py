@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.attacks import SIGNALS, World, stop
+from support.attacks import SIGNALS, SumoSimulation, stop
 from support.processes import wait_for
 
 from merge_sumo.files import TEMPORARY
@@ -64,19 +64,19 @@ VERBS = {
 }
 
 
-def given(world: World, verb: Verb, workers: int) -> tuple[object, ...]:
+def given(simulation: SumoSimulation, verb: Verb, workers: int) -> tuple[object, ...]:
     """Return the words of a verb where it stands."""
-    begun = verb.resume and (world.root / "new" / "campaign.json").exists()
+    begun = verb.resume and (simulation.root / "new" / "campaign.json").exists()
     words = (verb.resume if begun else verb.command).split()
     return *words, *(("--workers", workers) if verb.has_workers else ())
 
 
-def whole(verb: Verb, world: World) -> tuple[Any, dict[str, bytes], float]:
+def whole(verb: Verb, simulation: SumoSimulation) -> tuple[Any, dict[str, bytes], float]:
     """Return what a verb says and makes on one worker, and how long it takes."""
     start = time.monotonic()
-    code, out, err = world.run(*given(world, verb, 1))
+    code, out, err = simulation.run(*given(simulation, verb, 1))
     assert code in (0, 1), err
-    return said(out), made(world), time.monotonic() - start
+    return said(out), made(simulation), time.monotonic() - start
 
 
 @pytest.mark.slow
@@ -84,41 +84,41 @@ def whole(verb: Verb, world: World) -> tuple[Any, dict[str, bytes], float]:
 def test_what_was_stopped_is_made_to_the_byte_and_nothing_stays(name, run, tmp_path):
     verb, how = VERBS[name], VERBS[name].how
     told, expected, whole_s = whole(verb, prepared(run, tmp_path / "whole"))
-    world = prepared(run, tmp_path / "world")
-    before = made(world)
-    process = world.start(*given(world, verb, 2))
+    simulation = prepared(run, tmp_path / "simulation")
+    before = made(simulation)
+    process = simulation.start(*given(simulation, verb, 2))
     time.sleep(np.random.default_rng([len(name), len(how)]).uniform(0.3, 1.0) * whole_s)
     code, err = stop(process, how)
     # A worker that Python is about to start finds its parent killed.
     unborn = how == "SIGKILL" and "EOFError: Ran out of input" in err
     assert unborn or "Traceback" not in err, err
     assert "\x1b" not in err, "there is no terminal"
-    assert wait_for(world.has_ended), "left running"
+    assert wait_for(simulation.has_ended), "left running"
     if how != "SIGKILL":
         assert code in (0, 1, *(c for n in SIGNALS[how] for c in (128 + n, -n))), err
-        assert world.left_in_temporary() == []
-    for folder in world.temporary.iterdir():  # of a process that was killed
+        assert simulation.left_in_temporary() == []
+    for folder in simulation.temporary.iterdir():  # of a process that was killed
         removed(folder)
-    left = made(world)
+    left = made(simulation)
     assert {n: left.get(n) for n in before if n != "run/report.html"} == {
         n: content for n, content in before.items() if n != "run/report.html"
     }
-    again, out, err = world.run(*given(world, verb, 2))
+    again, out, err = simulation.run(*given(simulation, verb, 2))
     if again == 2 and "exists: choose another name" in err:  # a file or a folder of results
-        removed(world.root / ("new" if (world.root / "new").exists() else "curves.svg"))
-        again, out, err = world.run(*given(world, verb, 2))
+        removed(simulation.root / ("new" if (simulation.root / "new").exists() else "curves.svg"))
+        again, out, err = simulation.run(*given(simulation, verb, 2))
     assert again in (0, 1), err
-    assert world.left_in_temporary() == []
+    assert simulation.left_in_temporary() == []
     if not verb.resume:
         assert said(out) == told
-    assert made(world) == expected
+    assert made(simulation) == expected
 
 
-def prepared(run, root: Path) -> World:
-    world = World(root)
+def prepared(run, root: Path) -> SumoSimulation:
+    simulation = SumoSimulation(root)
     shutil.copytree(run.folder, root / "run")
     (root / "own.py").write_text(CONTROLLER)
-    return world
+    return simulation
 
 
 def said(out: str) -> Any:
@@ -132,11 +132,11 @@ VARYING = (".png", ".html")
 """Ends of names of files that hold times."""
 
 
-def made(world: World) -> dict[str, bytes]:
+def made(simulation: SumoSimulation) -> dict[str, bytes]:
     """Return the files with a name of ours, with nothing for the content of those that vary."""
     return {
         name: b"" if name.endswith(VARYING) else content
-        for name, content in world.files().items()
+        for name, content in simulation.files().items()
         if TEMPORARY not in name
     }
 

@@ -105,7 +105,7 @@ def test_an_output_merge_is_whether_to_merge(unit, version, wish):
     vut = in_process(f"fmu:{unit(version, merge=wish)}").open(2)
     begin(vut)
     assert vut.act(on_lane([-51.0, -50.0])).tolist() == [1.0, 1.0]
-    assert vut.wishes().tolist() == [STAY, MERGE]
+    assert vut.merge_requests().tolist() == [STAY, MERGE]
     vut.close()
 
 
@@ -128,6 +128,6 @@ def test_a_unit_gets_the_seed_of_each_case(unit, version, kind):
     path = unit(version, fault="u->v[4] = fmod(u->v[7], 1000.0) / 1000.0; return 0;", seed=kind)
     ran = run_cases(in_process(f"fmu:{path}"), fast, corridors=2)
     for case, trajectory in zip(fast, ran, strict=True):
-        seed = case.told_seed % 2**31 if kind == "integer" else case.told_seed
+        seed = case.controller_seed % 2**31 if kind == "integer" else case.controller_seed
         assert trajectory.a_vut_mps2[3] == seed % 1000 / 1000.0
-    assert max(case.told_seed for case in fast) > 2**31
+    assert max(case.controller_seed for case in fast) > 2**31

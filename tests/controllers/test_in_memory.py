@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 import merge_sumo as ms
-from merge_sumo.controllers.in_memory import is_here, spec_of
+from merge_sumo.controllers.in_memory import is_in_process, spec_of
 
 SMALL: dict[str, Any] = {"level": 0, "cases": 4, "seed": 1}
 
@@ -44,7 +44,7 @@ class TestASpec:
     def test_of_another_object_of_the_same_name_is_another(self):
         specs = [spec_of(lambda _: 0.0), spec_of(lambda _: 1.0)]
         assert len(set(specs)) == 2
-        assert all(map(is_here, specs))
+        assert all(map(is_in_process, specs))
 
     @pytest.mark.parametrize("thing", [None, object(), type("Nothing", (), {}), lambda: 0.0])
     def test_of_another_object_is_refused(self, thing):

@@ -47,11 +47,11 @@ def test_one_number_more_is_whether_to_merge_and_is_held_as_the_acceleration(tmp
         begin(vut)
         for step in (5, 6):
             assert vut.act(on_lane([-51.0])._replace(step=np.array([step]))).tolist() == [a_mps2]
-            assert vut.wishes().tolist() == [wish]
+            assert vut.merge_requests().tolist() == [wish]
     wrong = in_process(f"onnx:{network(tmp_path / 'nan.onnx', answer=[0.5, np.inf])}").open(1)
     begin(wrong)
     assert np.isnan(wrong.act(on_lane([-51.0])))[0]
-    assert wrong.reason(0) == "WrongAnswerError: wishes inf instead of a number, to merge or not"
+    assert wrong.reason(0) == "WrongAnswerError: requests inf instead of a number, to merge or not"
 
 
 @pytest.mark.parametrize("shape", [[], ["batch", 1]])
@@ -62,9 +62,9 @@ def test_a_network_with_an_input_seed_is_told_that_of_each_case(tmp_path, kind, 
     cases = cases_of(4)
     found = run_cases(in_process(f"onnx:{path}"), cases, corridors=2)
     for case, trajectory in zip(cases, found, strict=True):
-        expected = case.told_seed % 1000 / 1000.0
+        expected = case.controller_seed % 1000 / 1000.0
         assert trajectory.a_vut_mps2[:-1] == pytest.approx(expected, abs=1e-12)
-    assert len({case.told_seed for case in cases}) == 4
+    assert len({case.controller_seed for case in cases}) == 4
 
 
 REFUSED: dict[str, tuple[dict, str]] = {

@@ -187,6 +187,6 @@ def test_a_controller_that_takes_a_seed_draws_again_for_each_draw_and_repeats_it
     second = replace(first, draw=1)
     ran = run_cases(in_process(write_vut(source)), [first, second, first])
     for case, trajectory in zip((first, second, first), ran, strict=True):
-        drawn = random.Random(case.told_seed).uniform(0.0, 1.0)  # noqa: S311
+        drawn = random.Random(case.controller_seed).uniform(0.0, 1.0)  # noqa: S311
         assert trajectory.motion[0, VUT, 2] == drawn
-    assert first.told_seed != second.told_seed
+    assert first.controller_seed != second.controller_seed

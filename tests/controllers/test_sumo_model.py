@@ -18,7 +18,7 @@ from merge_sumo.scenario.case import Case
 from merge_sumo.scenario.scenario import DT_S, US23, VUT
 from merge_sumo.scenario.trajectory import End
 from merge_sumo.sumo.binding import sumo_program
-from merge_sumo.sumo.world import World
+from merge_sumo.sumo.sumo_simulation import SumoSimulation
 
 FREE = Case(level=0, x_pov0_m=0.0, v_pov0_mps=45.0, scenario=US23)
 """The POV is gone before the VUT arrives."""
@@ -43,14 +43,14 @@ def test_every_model_drives_the_same_in_1_and_in_8_corridors_and_by_eq_4(model):
 def test_a_free_driver_follows_what_sumo_drives_by_itself(model):
     """SUMO moves by the new speed and eq. (4) by the old: less than a metre apart at M."""
     (ours,) = run_cases(factory(model), [FREE], corridors=1)
-    with World(1, vut_type=factory(model).vut_type, scenario=US23) as world:
-        world.place(0, [(0.0, 45.0), (-182.0, 18.0)])
+    with SumoSimulation(1, vut_type=factory(model).vut_type, scenario=US23) as simulation:
+        simulation.place(0, [(0.0, 45.0), (-182.0, 18.0)])
         x_m, speeds = [], []
         for _ in range(len(ours.motion) - 1):
-            world._step_simulation()
-            world.read()
-            x_m.append(world.x_m[VUT, 0])
-            speeds.append(world.v_mps[VUT, 0])
+            simulation._step_simulation()
+            simulation.read()
+            x_m.append(simulation.x_m[VUT, 0])
+            speeds.append(simulation.v_mps[VUT, 0])
     assert ours.v_vut_mps[1:] == pytest.approx(speeds, abs=0.05)
     gained = (speeds[-1] - 18.0) * DT_S
     assert np.abs(ours.x_vut_m[1:] - x_m).max() <= gained + 0.05

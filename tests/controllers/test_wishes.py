@@ -11,7 +11,7 @@ import pytest
 from support.vut_contract import ON_LANE, begin, factory, on_lane
 
 from merge_sumo.controllers.controller import Start, seen_in
-from merge_sumo.drivers.base import MERGE, NO_WISH, STAY, VutLostError
+from merge_sumo.drivers.base import MERGE, NO_REQUEST, STAY, ControllerDiedError
 
 
 def begun(vut, corridors, **options):
@@ -74,10 +74,10 @@ def test_a_controller_answers_an_acceleration_or_it_and_a_merge_request(write_vu
     try:
         answer = driver.act(on_lane([-150.0, -90.0, -71.0, -50.0], [False, False, False, True]))
         assert answer.tolist() == [1.0, 1.0, 1.0, 0.5]
-        assert driver.wishes().tolist() == [NO_WISH, STAY, MERGE, NO_WISH]
-        assert driver.wishes().dtype == np.int8
+        assert driver.merge_requests().tolist() == [NO_REQUEST, STAY, MERGE, NO_REQUEST]
+        assert driver.merge_requests().dtype == np.int8
         driver.act(on_lane([-150.0] * 4, [False] * 4))
-        assert driver.wishes() is None
+        assert driver.merge_requests() is None
     finally:
         driver.close()
 
@@ -89,19 +89,19 @@ def test_a_batched_controller_answers_one_row_or_two(write_vut, process):
     driver = begun(write_vut(OF_ALL), 3, in_process=process == "this")
     try:
         assert driver.act(idle).tolist() == [1.0, 1.0, 0.5]
-        assert driver.wishes().tolist() == [STAY, MERGE, NO_WISH]
+        assert driver.merge_requests().tolist() == [STAY, MERGE, NO_REQUEST]
     finally:
         driver.close()
     one_row = write_vut(OF_ALL.replace(", seen.may_merge", ""), file="one_row.py")
     driver = begun(one_row, 3, in_process=True)
     assert driver.act(idle).tolist() == [1.0, 1.0, 0.5]
-    assert driver.wishes() is None
+    assert driver.merge_requests() is None
 
 
 REQUESTS = {"True": MERGE, "0.0": STAY, "np.array(1)": MERGE}
 WRONG = {
-    "(1.0, float('nan'))": "wishes nan (float) instead of True or False",
-    "(1.0, 'yes')": "wishes 'yes' (str) instead of True or False",
+    "(1.0, float('nan'))": "requests nan (float) instead of True or False",
+    "(1.0, 'yes')": "requests 'yes' (str) instead of True or False",
     "('1', True)": "answered '1' (str) instead of a number",
     "(1.0, True, 2)": "answered (1.0, True, 2) (tuple) instead of a number, or (number, merge)",
     "Pair((1.0, True))": "ZeroDivisionError: division by zero",
@@ -120,7 +120,7 @@ def Vut(seen):
 def test_a_merge_request_is_true_or_false(write_vut, request_):
     driver = begun(write_vut(ANSWERS.format(f"(1, {request_})")), 1, in_process=True)
     assert driver.act(on_lane([-71.0], [False])).tolist() == [1.0]
-    assert driver.wishes().tolist() == [REQUESTS[request_]]
+    assert driver.merge_requests().tolist() == [REQUESTS[request_]]
 
 
 @pytest.mark.parametrize("answer", WRONG)
@@ -141,7 +141,7 @@ def test_another_answer_is_an_error_of_its_own_corridor(write_vut, answer):
 def test_a_batch_of_another_shape_is_an_error_of_all(write_vut, answer, said):
     source = OF_ALL.replace("np.where(seen.merged, 0.5, 1.0), seen.may_merge", answer)
     driver = begun(write_vut(source), 2, in_process=True)
-    with pytest.raises(VutLostError, match=re.escape(said)):
+    with pytest.raises(ControllerDiedError, match=re.escape(said)):
         driver.act(on_lane([-71.0, -90.0], [False, False]))
 
 
@@ -151,8 +151,8 @@ def test_a_wrong_merge_request_of_a_batch_is_an_error_of_its_own_corridor(write_
     idle = on_lane([-71.0, -90.0, -71.0], [False] * 3)
     idle = idle._replace(active=np.array([True, True, False]))
     assert np.isnan(driver.act(idle)).tolist() == [True, False, False]
-    assert driver.reason(0) == "wishes nan instead of 1 or 0, to merge or not"
-    assert driver.wishes().tolist() == [NO_WISH, STAY, NO_WISH]
+    assert driver.reason(0) == "requests nan instead of 1 or 0, to merge or not"
+    assert driver.merge_requests().tolist() == [NO_REQUEST, STAY, NO_REQUEST]
 
 
 def test_a_process_that_forges_merge_requests_loses_its_episodes_and_no_more(write_vut):
@@ -164,7 +164,7 @@ def Vut(seen):
 """
     driver = begun(write_vut(source), 2, deadline_s=1.0)
     try:
-        with pytest.raises(VutLostError, match="broke the channel to its process"):
+        with pytest.raises(ControllerDiedError, match="broke the channel to its process"):
             driver.act(on_lane([-71.0, -71.0], [False, False]))
     finally:
         driver.close()

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from support.vut_contract import ON_LANE, begin, factory, run_on
 
-from merge_sumo.drivers.base import MERGE, NO_WISH, STAY, Scene
+from merge_sumo.drivers.base import MERGE, NO_REQUEST, STAY, Scene
 from merge_sumo.drivers.gap_choice import HEADWAY, GapChoice, GapChoiceVut
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.scenario.scenario import DT_S, US23
@@ -28,7 +28,7 @@ def asked(x_m, v_mps, *, merged=False, choice=HEADWAY) -> tuple[float, int]:
     vut = GapChoiceVut(1, choice)
     begin(vut)
     answer = vut.act(scene(x_m, v_mps, merged=merged))
-    return float(answer[0]), int(vut.wishes()[0])
+    return float(answer[0]), int(vut.merge_requests()[0])
 
 
 @pytest.mark.parametrize(
@@ -57,7 +57,7 @@ def test_both_gaps_count_and_so_does_the_headway():
 def test_it_requests_no_merge_before_the_gore_and_on_the_mainline():
     assert asked([500.0, -72.1], [30.0, 20.0]) == (1.0, STAY)
     assert asked([500.0, -72.0], [30.0, 20.0]) == (1.0, MERGE)
-    assert asked([500.0, -40.0], [30.0, 20.0], merged=True) == (1.0, NO_WISH)
+    assert asked([500.0, -40.0], [30.0, 20.0], merged=True) == (1.0, NO_REQUEST)
 
 
 def test_without_a_lane_it_is_the_level_0_vut():
@@ -67,7 +67,7 @@ def test_without_a_lane_it_is_the_level_0_vut():
     begin(level0, case)
     at_m = scene([-45.0, -40.0], [30.0, 27.95])._replace(merged=None)
     assert vut.act(at_m).tolist() == level0.act(at_m).tolist() == [pytest.approx(0.5)]
-    assert vut.wishes().tolist() == [NO_WISH]
+    assert vut.merge_requests().tolist() == [NO_REQUEST]
 
 
 def test_without_a_gap_it_stands_before_the_end_of_the_lane_and_waits():
@@ -76,7 +76,7 @@ def test_without_a_gap_it_stands_before_the_end_of_the_lane_and_waits():
     x, v, hardest = -40.0, 24.0, 0.0
     for _ in range(200):
         a = float(vut.act(scene([x, x], [v, v]))[0])
-        assert vut.wishes().tolist() == [STAY]
+        assert vut.merge_requests().tolist() == [STAY]
         hardest = min(hardest, a)
         x, v = x + v * DT_S, max(v + a * DT_S, 0.0)
     assert v == pytest.approx(0.0, abs=1e-9)

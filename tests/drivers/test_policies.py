@@ -31,7 +31,7 @@ from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.scenario.case import from_unit
 from merge_sumo.scenario.scenario import US23
 from merge_sumo.simulation.evaluate import simulate
-from merge_sumo.simulation.kinematic_world import EquationWorld
+from merge_sumo.simulation.kinematic_simulation import KinematicSimulation
 from merge_sumo.simulation.povs import Povs
 from merge_sumo.simulation.rollout import Rollout
 from merge_sumo.training.best_response import best_response
@@ -128,10 +128,10 @@ class TestALimitOfBraking:
 
     def test_holds_in_a_simulation_in_which_the_vut_brakes_harder(self):
         corridors, case = 2, from_unit(np.array([[0.5, 0.5]]), 1, scenario=US23)[0]
-        world = EquationWorld(corridors, road_for(US23), US23)
+        simulation = KinematicSimulation(corridors, road_for(US23), US23)
         pov = LevelKDriver(corridors, QNetwork(self.LAYERS, -2.0))
         vut = LevelKDriver(corridors, QNetwork(self.LAYERS))
-        (found,) = Rollout(world, pov, vut, [case]).run()
+        (found,) = Rollout(simulation, pov, vut, [case]).run()
         assert found.a_pov_mps2[:10].tolist() == [-2.0] * 10
         assert found.a_vut_mps2[:10].tolist() == [-4.0] * 10
 

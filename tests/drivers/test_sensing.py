@@ -128,12 +128,12 @@ def test_in_traffic_the_conflicting_car_is_one_that_is_seen():
     driver = SensedDriver(inner)
     driver.begin(0, case)
     x_m, v_mps = np.array(case.starts()).T[..., None]
-    facing = np.array([POV])
-    driver.act(Scene(np.array([True]), np.array([0]), x_m, v_mps, facing=facing))
+    conflicting = np.array([POV])
+    driver.act(Scene(np.array([True]), np.array([0]), x_m, v_mps, conflicting=conflicting))
     (scene,) = inner.scenes
     # The car ahead, at -210 m, is 28 m away; the POV and the car behind are not seen.
     assert scene.x_m[:, 0].tolist() == [far_m(scenario), -182.0, -210.0, far_m(scenario)]
-    assert scene.facing.tolist() == [2]
+    assert scene.conflicting.tolist() == [2]
 
 
 def test_a_vut_of_sumo_takes_no_sensors():
@@ -151,7 +151,7 @@ class TestSettings:
             act=Actuation(lag_s=0.2),
             out=tmp_path / "run",
         )
-        recorded = run.run.record["scenario"]
+        recorded = run.recorded.record["scenario"]
         assert recorded["sense"] == {"delay_s": [0.0, 0.5], "noise_x_m": 0.5}
         assert recorded["act"] == {"lag_s": 0.2}
         delays = [row["sense_delay_s"] for row in run.cases]
@@ -159,7 +159,7 @@ class TestSettings:
         assert 0.3 < max(delays) <= 0.5
         assert not ms.rerun(run).worse
         again = ms.run(recorded=(run, 3))
-        assert again.measures == run.run.outcome(3).measures
+        assert again.measures == run.recorded.outcome(3).measures
         assert "sensing delay" in run.report().read_text(encoding="utf-8")
 
     @pytest.mark.parametrize(

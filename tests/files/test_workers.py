@@ -15,13 +15,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.attacks import World
+from support.attacks import SumoSimulation
 from support.campaigning import campaign_settings, run_campaign
 from support.plans import plan_for
 from support.processes import wait_for
 
 from merge_sumo import api
-from merge_sumo.campaigns.run import OUTCOMES
+from merge_sumo.campaigns.recorded import OUTCOMES
 from merge_sumo.errors import Notice, UserError
 from merge_sumo.scenario.case import from_unit
 from merge_sumo.scenario.scenario import US23
@@ -243,10 +243,10 @@ class TestADaskCluster:
     @pytest.mark.slow
     def test_that_is_gone_is_a_sentence_that_says_how_to_go_on(self, cluster, tmp_path):
         address, _, scheduler = cluster
-        world = World(tmp_path / "world")
+        simulation = SumoSimulation(tmp_path / "simulation")
         words = "campaign --vut design1 --level 0 --sampler uniform --cases 20000 --out run"
-        process = world.start(*words.split(), "--gate", "fmc>0.5", "--workers", address)
-        outcomes = world.root / "run" / OUTCOMES
+        process = simulation.start(*words.split(), "--gate", "fmc>0.5", "--workers", address)
+        outcomes = simulation.root / "run" / OUTCOMES
         assert wait_for(lambda: outcomes.exists() or process.poll() is not None)
         scheduler.kill()
         _, err = process.communicate(timeout=120)

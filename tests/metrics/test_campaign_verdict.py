@@ -16,7 +16,7 @@ from support.campaigning import campaign_settings, run_campaign
 from support.handmade import write_run
 
 import merge_sumo as ms
-from merge_sumo.campaigns.run import Run, failures
+from merge_sumo.campaigns.recorded import RecordedCampaign, failures
 from merge_sumo.errors import UserError
 from merge_sumo.metrics.summary import Gate, LevelSummary, Summary, judge, parse_gates, summarise
 from merge_sumo.printable import counted
@@ -54,7 +54,7 @@ def test_errors_and_timeouts_are_grouped_by_message_errors_first_then_the_most_f
     errors = {2: "boom", 5: "other", 6: "other"}
     run = write_run(tmp_path / "run", 10, levels=(0,), errors=errors, timeouts=(0, 1, 3, 4))
     found = judge(run.outcomes)
-    assert [(t.end, t.message, t.cases) for t in found.troubles] == [
+    assert [(t.end, t.message, t.cases) for t in found.error_groups] == [
         (End.VUT_ERROR, "other", (5, 6)),
         (End.VUT_ERROR, "boom", (2,)),
         (End.TIMEOUT, "the VUT did not reach the merge point in 12 s", (0, 1, 3, 4)),
@@ -97,7 +97,7 @@ def read_junit(file: Path) -> etree._Element:
 
 
 @pytest.fixture(scope="module")
-def written(tmp_path_factory) -> Run:
+def written(tmp_path_factory) -> RecordedCampaign:
     vut = HOSTILE.replace("\ud800", "")
     folder = tmp_path_factory.mktemp("junit") / "run"
     return write_run(folder, 20, (0, 2), vut=vut, errors={3: HOSTILE}, timeouts=(4, 6))
@@ -156,8 +156,8 @@ def test_an_undecided_case_is_skipped_in_junit(tmp_path):
     settings = campaign_settings(vut=CHANCE, cases=40, seed=100, tolerated=0.5, repeat=1)
     opened = ms.open_run(run_campaign(settings, tmp_path / "run").folder)
     number = opened.verdict.undecided
-    assert number == len(failures(opened.run.outcomes)) > 0, "each case ran once"
-    write_junit(tmp_path / "junit.xml", opened.run, opened.facts, opened.verdict, [])
+    assert number == len(failures(opened.recorded.outcomes)) > 0, "each case ran once"
+    write_junit(tmp_path / "junit.xml", opened.recorded, opened.facts, opened.verdict, [])
     root = read_junit(tmp_path / "junit.xml")
     assert (root.get("failures"), root[1].get("skipped")) == ("0", str(number))
     assert all(one.get("message").startswith("undecided: ") for one in root.iter("skipped"))

@@ -55,9 +55,9 @@ def test_the_first_draw_is_the_case_as_it_was_and_others_have_other_seeds():
 def test_the_seed_of_a_controller_reveals_neither_level_nor_orientation():
     other = replace(CASE, svo_rad=1.0)
     below = replace(CASE, level=1, svo_rad=None)
-    assert CASE.told_seed == other.told_seed == below.told_seed
-    assert CASE.told_seed != replace(CASE, draw=1).told_seed
-    assert CASE.told_seed != replace(CASE, x_pov0_m=-274.0).told_seed
+    assert CASE.controller_seed == other.controller_seed == below.controller_seed
+    assert CASE.controller_seed != replace(CASE, draw=1).controller_seed
+    assert CASE.controller_seed != replace(CASE, x_pov0_m=-274.0).controller_seed
 
 
 def test_a_record_names_the_draw_only_where_it_is_not_the_first():

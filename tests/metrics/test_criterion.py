@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from metrics.test_score import CASE, ending
 from support.campaigning import campaign_settings, run_campaign
 
-from merge_sumo.campaigns.run import Run
+from merge_sumo.campaigns.recorded import RecordedCampaign
 from merge_sumo.errors import UserError
 from merge_sumo.metrics.bodies import SPACING_M, CentreLines, closest_before_m
 from merge_sumo.metrics.criterion import PAPER_CRITERION, Criterion, vocabulary
@@ -162,16 +162,17 @@ class TestMeasures:
 class TestNamed:
     def test_contact_is_of_bodies_and_not_of_points(self):
         # 5 m long: at 5.5 m between the fronts, a failure of the paper, they do not touch.
-        assert PAPER_CRITERION.judged(ending(5.5)).failed
-        assert not Criterion("contact").judged(ending(5.5)).failed
+        assert PAPER_CRITERION.bare_outcome(ending(5.5)).failed
+        assert not Criterion("contact").bare_outcome(ending(5.5)).failed
         # 0.1 m of overlap.
-        assert Criterion("contact").judged(ending(-4.9)).margin == pytest.approx(-0.1)
+        assert Criterion("contact").bare_outcome(ending(-4.9)).margin == pytest.approx(-0.1)
 
     def test_may_be_part_of_a_condition(self):
         either = Criterion('unsafe or end == "TIMEOUT"')
-        assert either.text == "unsafe or end == 'TIMEOUT'"
-        assert of(either.text, ending(-25.0, v_pov=36.0, v_vut=26.0)) == pytest.approx(-1.0 / 3.0)
-        assert of(either.text, ending(9.0, end=End.TIMEOUT)) == -1.0
+        assert either.as_written == "unsafe or end == 'TIMEOUT'"
+        hard = ending(-25.0, v_pov=36.0, v_vut=26.0)
+        assert of(either.as_written, hard) == pytest.approx(-1.0 / 3.0)
+        assert of(either.as_written, ending(9.0, end=End.TIMEOUT)) == -1.0
         assert of("not (contact or paper)", ending(-25.0, v_pov=27.0)) < 0.0
         with pytest.raises(UserError, match="did you mean unsafe"):
             Criterion("unsave or ttc_s < 1")
@@ -240,13 +241,18 @@ class TestOutcomes:
     def test_have_a_gap_of_1_where_the_criterion_turns(self):
         # A TTC of 4.2 s, against 4: 1 + 0.05; then 2 s, against 4: 1 / (1 + 0.5).
         criterion = Criterion("ttc_s < 4")
-        assert criterion.judged(ending(-21.0, v_pov=31.0)).signed_gap == pytest.approx(-1.05)
-        assert criterion.judged(ending(20.0, v_pov=16.0)).signed_gap == pytest.approx(1.0 / 1.5)
-        assert PAPER_CRITERION.judged(ending(-21.0)).signed_gap == pytest.approx(-3.5)
+        assert criterion.bare_outcome(ending(-21.0, v_pov=31.0)).signed_gap == pytest.approx(-1.05)
+        assert criterion.bare_outcome(ending(20.0, v_pov=16.0)).signed_gap == pytest.approx(
+            1.0 / 1.5
+        )
+        assert PAPER_CRITERION.bare_outcome(ending(-21.0)).signed_gap == pytest.approx(-3.5)
 
 
 def test_a_campaign_by_a_condition_on_the_score_is_that_of_the_paper_and_read_back(tmp_path):
     for name, fail_when in (("paper", "paper"), ("mine", "score < -500")):
         settings = campaign_settings(vut="design1", cases=20, batch=20, fail_when=fail_when)
         run_campaign(settings, tmp_path / name)
-    assert Run(tmp_path / "mine").outcomes == Run(tmp_path / "paper").outcomes
+    assert (
+        RecordedCampaign(tmp_path / "mine").outcomes
+        == RecordedCampaign(tmp_path / "paper").outcomes
+    )

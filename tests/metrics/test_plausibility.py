@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from merge_sumo.campaigns.run import Run
+from merge_sumo.campaigns.recorded import RecordedCampaign
 from merge_sumo.metrics.criterion import Criterion, condition_of, values_of
 from merge_sumo.metrics.measures import Measures
 from merge_sumo.metrics.plausibility import doubts, mostly_clipped
@@ -65,11 +65,11 @@ class TestDoubts:
         assert note[1:] in Path("run/report.html").read_text()
 
 
-def under(run: Run, criterion: Criterion) -> list[str]:
+def under(run: RecordedCampaign, criterion: Criterion) -> list[str]:
     """Return what is doubted of the outcomes of a run under another criterion."""
     judged = []
     for outcome in run.outcomes:
-        condition = condition_of(criterion.words)
+        condition = condition_of(criterion.condition)
         margin = None if criterion.is_papers else condition.margin(values_of(outcome.measures))
         judged.append(replace(outcome, margin=margin))
     return doubts(judged, criterion, {})

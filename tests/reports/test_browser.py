@@ -15,7 +15,7 @@ from conftest import require
 from support.handmade import write_run
 
 from merge_sumo.analysis.explanation import EXPLANATIONS, Axis, Explanation
-from merge_sumo.campaigns.run import Run, failures, spread_failures
+from merge_sumo.campaigns.recorded import RecordedCampaign, failures, spread_failures
 from merge_sumo.metrics.merge import Conflict
 from merge_sumo.records import to_plain
 from merge_sumo.reports import report
@@ -38,7 +38,7 @@ def browser():
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory) -> Run:
+def made(tmp_path_factory) -> RecordedCampaign:
     run = write_run(tmp_path_factory.mktemp("browser") / "run", error=None)
     report.write_report(run)
     return run

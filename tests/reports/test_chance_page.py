@@ -14,7 +14,7 @@ from reports.test_browser import browser, shown  # noqa: F401 (a fixture)
 from scipy.stats import beta, binomtest
 from support.campaigning import run_campaign
 
-from merge_sumo.campaigns.run import Run
+from merge_sumo.campaigns.recorded import RecordedCampaign
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.reports.report import REPORT, write_report
 from merge_sumo.scenario.scenario import US23
@@ -24,7 +24,7 @@ TOLERATED, RUNS = 0.2, 4
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory) -> Run:
+def made(tmp_path_factory) -> RecordedCampaign:
     settings = CampaignSettings(
         vut=f"{CONTROLLERS}:Slope",
         levels=(0,),
@@ -39,7 +39,7 @@ def made(tmp_path_factory) -> Run:
     return run
 
 
-def recorded(run: Run) -> dict[tuple, list[tuple[int, bool]]]:
+def recorded(run: RecordedCampaign) -> dict[tuple, list[tuple[int, bool]]]:
     """Return index and verdict of each run, by the start of its case, from the file alone."""
     cases: dict[tuple, list[tuple[int, bool]]] = {}
     for line in (run.folder / "outcomes.jsonl").read_text().splitlines():

@@ -18,7 +18,7 @@ from support.handmade import write_run
 
 import merge_sumo as ms
 from merge_sumo.campaigns.campaign import export_case
-from merge_sumo.campaigns.run import failures
+from merge_sumo.campaigns.recorded import failures
 from merge_sumo.errors import Notice, UserError
 from merge_sumo.reports.exports import columns_of, write_openscenario, write_table
 from merge_sumo.road.merge import road_for, road_of

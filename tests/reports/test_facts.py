@@ -14,7 +14,7 @@ from support.calling import invoke
 from support.handmade import write_run
 
 from merge_sumo.analysis.counterfactuals import AVOIDANCE, Avoidance
-from merge_sumo.campaigns.run import Run, failures
+from merge_sumo.campaigns.recorded import RecordedCampaign, failures
 from merge_sumo.reports import report_model
 from merge_sumo.reports.facts import CONTACT, Fact
 from merge_sumo.reports.report import report_page
@@ -23,7 +23,7 @@ from merge_sumo.results import CampaignRun
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory) -> Run:
+def made(tmp_path_factory) -> RecordedCampaign:
     run = write_run(tmp_path_factory.mktemp("facts") / "run", errors={3: "boom"}, timeouts=(4, 6))
     worst, *others = (o.index for o in failures(run.outcomes))
     lines = [Avoidance(worst, ("careful", "rss"), 3.0, pov_careful=True)]
@@ -72,7 +72,7 @@ def test_the_simulated_time_has_the_follow_up(run, tmp_path):
     assert driven_s > up_to_m_s + len(run.outcomes), "more than a second a case"
     for name in ("campaign.json", "outcomes.jsonl"):
         (tmp_path / name).write_bytes((run.folder / name).read_bytes())
-    assert Run(tmp_path).simulated_s == pytest.approx(up_to_m_s), "the motion is lost"
+    assert RecordedCampaign(tmp_path).simulated_s == pytest.approx(up_to_m_s), "the motion is lost"
 
 
 def test_are_listed_once_each_with_a_key_and_a_file_of_the_folder(made, facts):

@@ -15,7 +15,7 @@ from lxml import html
 from support.handmade import write_run
 
 from merge_sumo.analysis.surface import learn_surface
-from merge_sumo.campaigns.run import Run, failures, spread_failures
+from merge_sumo.campaigns.recorded import RecordedCampaign, failures, spread_failures
 from merge_sumo.controllers.process import LINES, LOG
 from merge_sumo.reports import report_model
 from merge_sumo.reports.report import report_page
@@ -27,7 +27,7 @@ EVIL = "</script><script>alert(1)</script><img src=x onerror=alert(2)>&\"'"
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory) -> Run:
+def made(tmp_path_factory) -> RecordedCampaign:
     return write_run(tmp_path_factory.mktemp("made") / "run")
 
 

@@ -19,7 +19,7 @@ from support.campaigning import run_campaign
 
 import merge_sumo as ms
 from merge_sumo.analysis.counterfactuals import causes
-from merge_sumo.campaigns.run import Run
+from merge_sumo.campaigns.recorded import RecordedCampaign
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.metrics.cause import cause
 from merge_sumo.metrics.outcome import Outcome
@@ -200,11 +200,11 @@ def check_avoided(text: str, motion: Motion) -> None:
 
 
 @pytest.fixture(scope="module")
-def campaign_of(tmp_path_factory) -> Callable[[str], Run]:
+def campaign_of(tmp_path_factory) -> Callable[[str], RecordedCampaign]:
     """Return the function that runs the campaign of a controller, once."""
 
     @cache
-    def run(vut: str) -> Run:
+    def run(vut: str) -> RecordedCampaign:
         folder = tmp_path_factory.mktemp("sentences")
         settings = CampaignSettings(
             vut=spec_of(vut, folder),
@@ -221,7 +221,7 @@ def campaign_of(tmp_path_factory) -> Callable[[str], Run]:
 
 
 @pytest.fixture(params=VUTS)
-def campaign(request, campaign_of) -> Run:
+def campaign(request, campaign_of) -> RecordedCampaign:
     return campaign_of(request.param)
 
 

@@ -17,7 +17,7 @@ from merge_sumo.road.finder import RoadNet, find_corridor, read_net
 from merge_sumo.road.merge import road_for
 from merge_sumo.scenario.scenario import US23
 from merge_sumo.sumo.binding import load_libsumo
-from merge_sumo.sumo.world import World
+from merge_sumo.sumo.sumo_simulation import SumoSimulation
 
 
 @pytest.mark.parametrize("name", FOREIGN)
@@ -94,10 +94,10 @@ def test_a_start_before_the_path_is_refused(corridor):
     with pytest.raises(UserError, match=r"ramp main_out begins 425.0 m before .* further upstream"):
         road_for(replace(US23, x_vut0_m=-600.0))
     with (
-        World(1, corridor("priority"), scenario=US23) as world,
+        SumoSimulation(1, corridor("priority"), scenario=US23) as simulation,
         pytest.raises(UserError, match=r"begins 505\.94 m before"),
     ):
-        world.place(0, [(-340.0, 30.0), (-600.0, 12.0)])
+        simulation.place(0, [(-340.0, 30.0), (-600.0, 12.0)])
 
 
 @pytest.fixture(scope="module")

@@ -28,7 +28,7 @@ from merge_sumo.scenario.case import Case
 from merge_sumo.scenario.scenario import US23
 from merge_sumo.sumo import mirror
 from merge_sumo.sumo.opendrive import opendrive
-from merge_sumo.sumo.world import World
+from merge_sumo.sumo.sumo_simulation import SumoSimulation
 
 STEPS = 300
 RANDOM = np.random.default_rng(0).uniform(US23.a_min_mps2, US23.a_max_mps2 + 1.5, (STEPS, 2))
@@ -164,8 +164,8 @@ def test_an_odd_net_is_taken_by_every_kind_of_controller_and_export(tmp_path, us
     mirror.write_files(tmp_path, road, US23)
     assert b"main_out" in (tmp_path / mirror.NET).read_bytes()
     assert b"<road " in opendrive(road)
-    with World(1, road, scenario=US23) as world:
-        world.advance()
+    with SumoSimulation(1, road, scenario=US23) as simulation:
+        simulation.advance()
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ import pytest
 from support.campaigning import campaign_settings, run_campaign
 from support.plans import POVS, plan_for
 
-from merge_sumo.campaigns.run import Run
+from merge_sumo.campaigns.recorded import RecordedCampaign
 from merge_sumo.drivers.policies import HUMAN, policies_in, policies_of
 from merge_sumo.metrics.criterion import Criterion
 from merge_sumo.metrics.outcome import Outcome, Prediction
@@ -57,7 +57,7 @@ def seen():
 
 
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory) -> Run:
+def whole(tmp_path_factory) -> RecordedCampaign:
     return run_campaign(SETTINGS, tmp_path_factory.mktemp("whole") / "run")
 
 

@@ -10,7 +10,7 @@ from support.calling import invoke
 from support.foreign_nets import FOREIGN
 from support.merges import SMALLER
 
-from merge_sumo.campaigns.run import Run
+from merge_sumo.campaigns.recorded import RecordedCampaign
 from merge_sumo.campaigns.scenario_suggestion import suggested, unseen
 from merge_sumo.errors import UserError
 from merge_sumo.metrics.measures import Measures
@@ -117,7 +117,7 @@ def test_a_campaign_on_a_net_of_ones_own_is_two_commands(tmp_path, name):
     options = ("--vut", "level0", "--level", "0", "--cases", "24", "--sampler", "uniform")
     ended = invoke("campaign", *options, "--scenario", file, "--out", tmp_path / "run", "--quiet")
     assert ended.exit_code == 0, ended.output
-    run = Run(tmp_path / "run")
+    run = RecordedCampaign(tmp_path / "run")
     assert all(o.measures.end.is_tested for o in run.outcomes)
     assert {o.failed for o in run.outcomes} == {True, False}, "it has a conflict"
     x, v, a = run.trajectory(0).motion[:, 1].T

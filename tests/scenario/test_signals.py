@@ -39,8 +39,8 @@ class Vut:
 @pytest.mark.slow
 def test_every_step_has_what_was_left_at_it(write_vut, tmp_path):
     run = ms.campaign(write_vut(LEAVES), level=0, cases=40, sampler="uniform", out=tmp_path / "run")
-    for outcome in run.run.outcomes:
-        found = run.run.trajectory(outcome.index)
+    for outcome in run.recorded.outcomes:
+        found = run.recorded.trajectory(outcome.index)
         x_pov_m, x_vut_m = found.whole[:, POV, 0], found.whole[:, VUT, 0]
         gap_m = x_pov_m - x_vut_m
         left = found.signals["gap_m"]
@@ -69,8 +69,8 @@ class Vut:
 
 def test_hostile_names_and_words_are_cut_without_harm(write_vut, tmp_path):
     run = ms.campaign(write_vut(HOSTILE), level=0, cases=4, sampler="uniform", out=tmp_path / "run")
-    assert not any(outcome.measures.end.is_error for outcome in run.run.outcomes)
-    left = run.run.trajectory(0).signals
+    assert not any(outcome.measures.end.is_error for outcome in run.recorded.outcomes)
+    left = run.recorded.trajectory(0).signals
     assert {name: values[0] for name, values in left.items()} == {
         "=cmd()": "=1+1",
         "</script><b>": "\\x1b[2J\\u202e</script>",

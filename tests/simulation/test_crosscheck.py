@@ -37,12 +37,12 @@ def campaign_of(folder, name="us23"):
 
 
 def test_vehicles_move_by_the_speed_before_a_step_and_stop_at_0():
-    world = HighwayEnvWorld(2, road_for(US23), US23)
-    world.place(0, [(-100.0, 20.0), (-50.0, 0.1)])
-    world.command(np.array([[1.0, 0.0], [-4.0, 0.0]]))
-    assert world.x_m[:, 0].tolist() == pytest.approx([-98.0, -49.99], abs=1e-13)
-    assert world.v_mps[:, 0].tolist() == pytest.approx([20.1, 0.0], abs=1e-15)
-    assert world.x_m[VUT, 1] < -100.0, "a parked vehicle stays where it is"
+    simulation = HighwayEnvWorld(2, road_for(US23), US23)
+    simulation.place(0, [(-100.0, 20.0), (-50.0, 0.1)])
+    simulation.command(np.array([[1.0, 0.0], [-4.0, 0.0]]))
+    assert simulation.x_m[:, 0].tolist() == pytest.approx([-98.0, -49.99], abs=1e-13)
+    assert simulation.v_mps[:, 0].tolist() == pytest.approx([20.1, 0.0], abs=1e-15)
+    assert simulation.x_m[VUT, 1] < -100.0, "a parked vehicle stays where it is"
 
 
 @pytest.mark.parametrize("name", ["us23-lane-traffic", "roundabout"])

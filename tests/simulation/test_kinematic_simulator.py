@@ -19,8 +19,8 @@ from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.scenario.case import Case, from_unit
 from merge_sumo.scenario.scenario import OWN, US23, VUT, Scenario
 from merge_sumo.simulation.evaluate import simulate
+from merge_sumo.simulation.kinematic_simulation import KinematicSimulation
 from merge_sumo.simulation.kinematic_simulator import CHECKED_SHARE, drawn
-from merge_sumo.simulation.kinematic_world import EquationWorld
 from merge_sumo.simulation.plan import Engine, SimulationPlan
 from merge_sumo.simulation.povs import own_pov
 
@@ -94,13 +94,13 @@ class TestTheCheck:
 
     @pytest.mark.parametrize("off_m", [2e-6, 5.0])
     def test_stops_in_a_sentence_where_sumo_says_otherwise(self, monkeypatch, off_m):
-        command = EquationWorld.command
+        command = KinematicSimulation.command
 
-        def drift(world: EquationWorld, a_mps2: np.ndarray, merged: None) -> None:
-            command(world, a_mps2, merged)
-            world.x_m[VUT] += off_m / 80.0
+        def drift(simulation: KinematicSimulation, a_mps2: np.ndarray, merged: None) -> None:
+            command(simulation, a_mps2, merged)
+            simulation.x_m[VUT] += off_m / 80.0
 
-        monkeypatch.setattr(EquationWorld, "command", drift)
+        monkeypatch.setattr(KinematicSimulation, "command", drift)
         with pytest.raises(UserError, match=r"ends otherwise in SUMO .*: choose `engine` sumo"):
             simulate(plan_for("design1").with_engine("kinematic"), uniform(20, 0))
 

@@ -10,7 +10,7 @@ import pytest
 from simulation.test_kinematic_simulator import uniform
 from support.plans import plan_for
 
-from merge_sumo.drivers.base import MERGE, NO_WISH, STAY
+from merge_sumo.drivers.base import MERGE, NO_REQUEST, STAY
 from merge_sumo.drivers.lane import Merging
 from merge_sumo.metrics.measures import Measures
 from merge_sumo.road.scenario_file import named_scenario
@@ -41,8 +41,8 @@ class TestAMergeRequest:
             (100.0, STAY, False),
             (127.9, STAY, False),
             (128.0, STAY, True),
-            (-2.1, NO_WISH, False),
-            (-2.0, NO_WISH, True),
+            (-2.1, NO_REQUEST, False),
+            (-2.0, NO_REQUEST, True),
             (-2.0, None, True),
         ],
     )

@@ -49,7 +49,7 @@ def test_of_no_pov_are_refused(asked: Any, own, said):
 
 def test_two_are_tested_and_run_again(tmp_path):
     run = ms.campaign("design1", level="0,1", cases=20, seed=1, out=tmp_path / "run")
-    assert {outcome.case.level for outcome in run.run.outcomes} == {0, 1}
+    assert {outcome.case.level for outcome in run.recorded.outcomes} == {0, 1}
     again = ms.rerun(run, level=[0, 1]).to_record()
     assert sum(row["cases"] for row in again["steps"][0]["transitions"]) == 20
     with pytest.raises(UserError, match="has no cases at level '2': it has 0, 1, or all"):

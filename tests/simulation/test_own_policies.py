@@ -17,7 +17,7 @@ from support.calling import assert_refused
 from support.campaigning import campaign_settings, run_campaign
 from support.plans import plan_for
 
-from merge_sumo.campaigns.run import OUTCOMES, Run
+from merge_sumo.campaigns.recorded import OUTCOMES, RecordedCampaign
 from merge_sumo.drivers.levelk import ACTIONS, FEATURES
 from merge_sumo.drivers.policies import MANIFEST, MOST_BYTES, policies_in, policies_of
 from merge_sumo.errors import UserError
@@ -45,7 +45,7 @@ def write_network(folder: Path, name: str, tensors: dict[str, NDArray[Any]]) -> 
     (folder / MANIFEST).write_text(json.dumps(manifest))
 
 
-def campaign(policies: Path | None, out: Path, vut: str = "design2") -> Run:
+def campaign(policies: Path | None, out: Path, vut: str = "design2") -> RecordedCampaign:
     named = None if policies is None else str(policies)
     small: dict[str, Any] = {"levels": (1,), "cases": 24, "batch": 8, "seed": 2}
     asked = campaign_settings(vut=vut, policies=named, sampler="uniform", **small)

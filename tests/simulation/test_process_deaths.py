@@ -8,7 +8,7 @@ import sys
 import pytest
 from support.campaigning import campaign_settings, run_campaign
 
-from merge_sumo.campaigns.run import OUTCOMES, RAN_AGAIN, SETTINGS, Run
+from merge_sumo.campaigns.recorded import OUTCOMES, RAN_AGAIN, SETTINGS, RecordedCampaign
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.errors import UserError
 
@@ -36,7 +36,7 @@ def settings(spec: str, **more: object) -> CampaignSettings:
     return campaign_settings(vut=spec, cases=12, batch=12, seed=1, sampler="uniform", **more)
 
 
-def outcomes(run: Run) -> bytes:
+def outcomes(run: RecordedCampaign) -> bytes:
     return (run.folder / OUTCOMES).read_bytes()
 
 
@@ -45,7 +45,7 @@ def campaign(tmp_path):
     """Return a function that runs a campaign of a source."""
     (tmp_path / "flags").mkdir()
 
-    def run(name: str, source: str, **more: object) -> Run:
+    def run(name: str, source: str, **more: object) -> RecordedCampaign:
         (tmp_path / f"{name}.py").write_text(source, encoding="utf-8")
         return run_campaign(settings(f"{tmp_path / name}.py:Vut", **more), tmp_path / name)
 
@@ -53,7 +53,7 @@ def campaign(tmp_path):
 
 
 @pytest.fixture(scope="module")
-def calm(tmp_path_factory) -> Run:
+def calm(tmp_path_factory) -> RecordedCampaign:
     """Return a campaign in which nothing dies."""
     folder = tmp_path_factory.mktemp("calm")
     (folder / "calm.py").write_text(CALM, encoding="utf-8")

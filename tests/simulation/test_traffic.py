@@ -11,14 +11,14 @@ from support.plans import plan_for
 from merge_sumo.controllers.controller import seen_in
 from merge_sumo.controllers.kinds import load
 from merge_sumo.controllers.spec import ControllerOptions
-from merge_sumo.drivers.following import car_met, keep_safe, safe_speed_mps
+from merge_sumo.drivers.following import conflicting_car, keep_safe, safe_speed_mps
 from merge_sumo.metrics.measures import Measures
 from merge_sumo.scenario.case import Case, Pool, from_unit, to_unit
 from merge_sumo.scenario.scenario import AHEAD, BEHIND, DT_S, POV, US23, Scenario
 from merge_sumo.scenario.trajectory import End, Trajectory
 from merge_sumo.simulation.simulator import Simulator
 from merge_sumo.sumo.binding import load_libsumo
-from merge_sumo.sumo.world import World
+from merge_sumo.sumo.sumo_simulation import SumoSimulation
 
 TRAFFIC = replace(
     US23, name="us23-traffic", headway_ahead_s=(1.0, 4.0), headway_behind_s=(1.0, 4.0)
@@ -49,10 +49,10 @@ def test_the_safe_speed_is_that_of_sumos_original_krauss_model():
     attributes = {"carFollowModel": "KraussOrig1", "decel": "4", "tau": "1.3", "accel": "1000"}
     rng = np.random.default_rng(0)
     gaps, leaders = rng.uniform(0.5, 200.0, 200), rng.uniform(0.0, 45.0, 200)
-    with World(
+    with SumoSimulation(
         1, vut_type={**attributes, "minGap": "0", "maxSpeed": "200"}, scenario=US23
-    ) as world:
-        world.place(0, [(-340.0, 0.0), (-182.0, 18.0)])
+    ) as simulation:
+        simulation.place(0, [(-340.0, 0.0), (-182.0, 18.0)])
         theirs = []
         for gap, leader in zip(gaps.tolist(), leaders.tolist(), strict=True):
             theirs.append(libsumo.vehicle.getFollowSpeed("vut.0", 45.0, gap, leader, 4.0))
@@ -89,10 +89,10 @@ def test_the_conflicting_car_will_be_nearest_to_m():
     # At 28 m/s already, the VUT is at M in 5 s; then the cars are at -50, 10 and -40 m.
     x = np.array([[-200.0], [-140.0], [-140.0], [-190.0]])
     v = np.array([[30.0], [28.0], [30.0], [30.0]])
-    assert car_met(x, v, TRAFFIC).tolist() == [AHEAD]
-    assert car_met(x, v, replace(TRAFFIC, level0_v_mps=28.0 / 1.5)).tolist() == [AHEAD]
+    assert conflicting_car(x, v, TRAFFIC).tolist() == [AHEAD]
+    assert conflicting_car(x, v, replace(TRAFFIC, level0_v_mps=28.0 / 1.5)).tolist() == [AHEAD]
     x[AHEAD] = 0.0
-    assert car_met(x, v, TRAFFIC).tolist() == [BEHIND]
+    assert conflicting_car(x, v, TRAFFIC).tolist() == [BEHIND]
 
 
 def test_a_controller_sees_the_conflicting_car_as_pov_and_all_cars_from_the_front_on():

@@ -15,7 +15,7 @@ from lxml import etree
 from PIL import Image
 
 from merge_sumo.campaigns.campaign import export_case
-from merge_sumo.campaigns.run import failures
+from merge_sumo.campaigns.recorded import failures
 from merge_sumo.metrics.cause import cause
 from merge_sumo.metrics.merge import Conflict
 from merge_sumo.scenario.scenario import DT_S, rgb

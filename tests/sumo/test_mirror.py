@@ -77,7 +77,7 @@ def test_a_lane_change_anywhere_on_an_acceleration_lane_is_a_merge_request(name,
             if wishes:
                 vehicle.changeLane("vut", vehicle.getLaneIndex("vut") + 1, 0.0)
             assert session.step() == v_mps
-            assert merged or session.sumo.wants_to_merge == wishes
+            assert merged or session.sumo.requests_merge == wishes
             x_m += v_mps * DT_S
             merged = merged or wishes or x_m >= end_m
             states = {"pov": (x_m - 90.0, v_mps, 0.0), "vut": (x_m, v_mps, 0.0)}

@@ -20,7 +20,7 @@ from support.foreign_nets import LANE_M, lane_corridor_of
 from support.replays import assert_identical, commanded, write_replay
 
 from merge_sumo.campaigns.campaign import export_case
-from merge_sumo.campaigns.run import failures
+from merge_sumo.campaigns.recorded import failures
 from merge_sumo.errors import UserError
 from merge_sumo.road.merge import road_for, road_of
 from merge_sumo.road.scenario_file import named_scenario

@@ -8,7 +8,7 @@ from typing import Any
 
 from merge_sumo.campaigns import campaign
 from merge_sumo.campaigns.plan import resolve
-from merge_sumo.campaigns.run import Run, read_settings
+from merge_sumo.campaigns.recorded import RecordedCampaign, read_settings
 from merge_sumo.campaigns.settings import CampaignSettings, controllers, settings_of
 from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.scenario.scenario import US23
@@ -25,7 +25,7 @@ def run_campaign(
     *,
     on_case: Callable[[Outcome], None] = lambda _: None,
     **other: Any,
-) -> Run:
+) -> RecordedCampaign:
     def on_cases(outcomes: Sequence[Outcome]) -> None:
         for outcome in outcomes:
             on_case(outcome)
@@ -34,7 +34,9 @@ def run_campaign(
     return campaign.run_campaign(settings, resolve(settings), folder, callbacks, **other)
 
 
-def resume_campaign(folder: Path, given: Mapping[str, object] | None = None, **other: Any) -> Run:
+def resume_campaign(
+    folder: Path, given: Mapping[str, object] | None = None, **other: Any
+) -> RecordedCampaign:
     """Go on with a campaign, with its controllers named again as they were."""
     recorded = read_settings(folder)
     named = {**controllers(recorded), **(given or {})}

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from merge_sumo.campaigns.journal import Journal
-from merge_sumo.campaigns.run import Run
+from merge_sumo.campaigns.recorded import RecordedCampaign
 from merge_sumo.metrics.measures import FOLLOW_UP, OURS, Measures
 from merge_sumo.metrics.outcome import Episode, Outcome
 from merge_sumo.scenario.case import Case, from_unit
@@ -70,7 +70,7 @@ def write_run(
     timeouts: Collection[int] = (),
     scenario: Scenario = US23,
     **settings: Any,
-) -> Run:
+) -> RecordedCampaign:
     """Write a campaign of `per_level` cases at each level and return it.
 
     The last case errs, or instead of it those in `errors` and `timeouts`, by index.
@@ -97,4 +97,4 @@ def write_run(
             trajectory = drive(case, errors.get(index), timeout=index in timeouts)
             ran.append(Episode(Outcome(index, batch, case, Measures.of(trajectory)), trajectory))
         journal.append(ran)
-    return Run(folder)
+    return RecordedCampaign(folder)

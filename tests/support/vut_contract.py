@@ -1,4 +1,4 @@
-"""What the tests of all kinds of VUT share: cases, and running them in a real SUMO world."""
+"""What the tests of all kinds of VUT share: cases, and running them in a real SUMO simulation."""
 
 from __future__ import annotations
 

@@ -199,7 +199,7 @@ class Server:
         self._answer_step()
         self._serve_until_step()
         v_mps, sumo = session.step(), session.sumo
-        return Reply(v_mps=v_mps, merge=sumo.wants_to_merge, by_sumo=sumo.by_sumo)
+        return Reply(v_mps=v_mps, merge=sumo.requests_merge, by_sumo=sumo.by_sumo)
 
     def farewell(self) -> Reply:
         """Show the last arrival, with no vehicle to come, and give the client time to close."""

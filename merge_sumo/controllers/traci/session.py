@@ -199,7 +199,7 @@ class Session:
             reached_mps = moves.v_mps
         if v_mps is not None and reached_mps is not None:
             v_mps, self.sumo.by_sumo = reached_mps, False
-            self.sumo.wants_to_merge |= moves is not None and moves.on_mainline
+            self.sumo.requests_merge |= moves is not None and moves.on_mainline
         return v_mps
 
     def put(self, states: Mapping[str, State], *, merged: bool = False) -> None:

@@ -30,14 +30,14 @@ from merge_sumo.controllers.process import (
 )
 from merge_sumo.controllers.spec import ControllerKind, ControllerOptions, ControllerSpec
 from merge_sumo.controllers.traci.child import Child, FaultError, Reply
-from merge_sumo.drivers.base import MERGE, STAY, Driver, Scene, VutLostError
+from merge_sumo.drivers.base import MERGE, STAY, ControllerDiedError, Driver, Scene
 from merge_sumo.drivers.lane import END_MARGIN_M, stopping_mps
 from merge_sumo.errors import UserError
 from merge_sumo.files import check_code
 from merge_sumo.road.corridor import Corridor
 from merge_sumo.scenario.case import Case, FloatArray
 from merge_sumo.scenario.scenario import DT_S, VEHICLES, VUT, Scenario
-from merge_sumo.sumo.world import World
+from merge_sumo.sumo.sumo_simulation import SumoSimulation
 
 HOST = "127.0.0.1"
 DEFAULT_PORT = 8813
@@ -95,11 +95,11 @@ class TraciKind(ControllerKind):
         """Return whether an argument names the port at which a user's client is waited for."""
         return not argument or argument.isdecimal()
 
-    def driver(self, _corridors: int, world: object) -> Driver:
-        """Return a driver in a world of SUMO."""
-        if not isinstance(world, World):
-            raise UserError(f"{self.spec} drives in a SUMO world only")
-        road, scenario = world.road, world.scenario
+    def driver(self, _corridors: int, simulation: object) -> Driver:
+        """Return a driver in a simulation of SUMO."""
+        if not isinstance(simulation, SumoSimulation):
+            raise UserError(f"{self.spec} drives in a SUMO simulation only")
+        road, scenario = simulation.road, simulation.scenario
         return TraciVut(road, scenario, self._port, self._command, self.options)
 
 
@@ -145,7 +145,7 @@ class TraciVut(Driver):
         self._patience_s = options.connect_s
         try:
             self._connect()
-        except (FaultError, VutLostError) as error:
+        except (FaultError, ControllerDiedError) as error:
             self.close()
             raise UserError(str(error)) from error
         except BaseException:
@@ -154,7 +154,7 @@ class TraciVut(Driver):
 
     def begin(self, corridor: int, case: Case) -> None:
         """Note that the next scene is the first of an episode."""
-        self._reason, self._seed = None, case.told_seed
+        self._reason, self._seed = None, case.controller_seed
         self._before_mps.clear()
         self._in_vain.clear()
 
@@ -180,7 +180,7 @@ class TraciVut(Driver):
         """Let the client see the last arrival and end; then end it."""
         ends = True
         if self._client is not None:
-            with suppress(FaultError, VutLostError):
+            with suppress(FaultError, ControllerDiedError):
                 ends = self._ask("farewell").closed
         self._disconnect(grace=ends)
         self._child.kill()
@@ -198,7 +198,7 @@ class TraciVut(Driver):
         reply = self._step(self._seed, states=states, merged=merged)
         self._seed = None
         if scene.merged is not None:
-            self._wishes = np.array([MERGE if reply.merge else STAY], dtype=np.int8)
+            self._merge_requests = np.array([MERGE if reply.merge else STAY], dtype=np.int8)
         wanted_mps = reply.v_mps
         if wanted_mps is None:  # it is beyond the end of the net: it keeps its speed
             return 0.0
@@ -225,7 +225,12 @@ class TraciVut(Driver):
         raise FaultError("the controller closed the connection before the vehicles departed")
 
     def _ask(self, action: str, patience_s: float = 0.0, **values: Any) -> Reply:
-        """Return the reply of the serving process; raises `FaultError` and `VutLostError`."""
+        """Return the reply of the serving process.
+
+        Raises:
+            FaultError: the client made a mistake.
+            ControllerDiedError: the process has ended.
+        """
         patience_s += self._options.deadline_s + WORK_S
         try:
             reply = self._child.request(action, patience_s, **values)
@@ -235,7 +240,7 @@ class TraciVut(Driver):
                 raise FaultError(reason) from died
             # Killed from outside, or by a question of the client: the case runs again, which shows.
             self._disconnect()
-            raise VutLostError(reason) from died
+            raise ControllerDiedError(reason) from died
         self._in_vain.update(reply.in_vain)
         if not reply.fault or reply.closed:
             return reply

@@ -1,4 +1,4 @@
-"""The SUMO world against the paper's equations of motion, and episodes in it."""
+"""The SUMO simulation against the paper's equations of motion, and episodes in it."""
 
 # mypy: no-strict-optional
 
@@ -15,27 +15,27 @@ from merge_sumo.scenario.scenario import US23
 from merge_sumo.scenario.trajectory import End
 from merge_sumo.simulation.povs import PovLibrary
 from merge_sumo.simulation.rollout import Rollout
-from merge_sumo.sumo.world import SimulationError, World
+from merge_sumo.sumo.sumo_simulation import SimulationError, SumoSimulation
 
 
 def random_cases(count: int, seed: int = 0) -> list[Case]:
     return from_unit(np.random.default_rng(seed).random((count, 2)), level=0, scenario=US23)
 
 
-def run_all(world, pov, vut, cases):
-    return Rollout(world, pov, vut, cases).run()
+def run_all(simulation, pov, vut, cases):
+    return Rollout(simulation, pov, vut, cases).run()
 
 
 @pytest.mark.parametrize("speed_mps", [29.0, 31.0])
 def test_a_speed_that_is_not_what_sumo_was_told_shows_in_the_next_step(speed_mps):
-    with World(1, scenario=US23) as world:
-        world.place(0, [(-300.0, 30.0), (-182.0, 18.0)])
-        world.advance()
-        world.command(np.zeros((2, 1)))
-        world._set_speed("pov.0", speed_mps)
-        world.advance()
+    with SumoSimulation(1, scenario=US23) as simulation:
+        simulation.place(0, [(-300.0, 30.0), (-182.0, 18.0)])
+        simulation.advance()
+        simulation.command(np.zeros((2, 1)))
+        simulation._set_speed("pov.0", speed_mps)
+        simulation.advance()
         with pytest.raises(SimulationError, match=r"0\.1.* m away from where it drives"):
-            world.command(np.zeros((2, 1)))
+            simulation.command(np.zeros((2, 1)))
 
 
 @pytest.mark.parametrize("half_step", ["advance", "command"])
@@ -43,16 +43,16 @@ def test_when_sumo_fails_the_running_cases_are_sim_errors_and_the_others_go_on(
     monkeypatch, half_step
 ):
     cases = random_cases(30)
-    with World(4, scenario=US23) as world:
-        call, calls = getattr(world, half_step), iter(range(10_000))
+    with SumoSimulation(4, scenario=US23) as simulation:
+        call, calls = getattr(simulation, half_step), iter(range(10_000))
 
         def failing(*arguments):
             if next(calls) == 50:
                 raise SimulationError("the simulation broke")
             call(*arguments)
 
-        monkeypatch.setattr(world, half_step, failing)
-        trajectories = run_all(world, PovLibrary(4, POVS), Level0Vut(4), cases)
+        monkeypatch.setattr(simulation, half_step, failing)
+        trajectories = run_all(simulation, PovLibrary(4, POVS), Level0Vut(4), cases)
     broken = [t for t in trajectories if t.end is End.SIM_ERROR]
     assert len(broken) == 4
     assert all("the simulation broke" in t.error for t in broken)

@@ -1,6 +1,6 @@
 """K corridors that are moved by the equations of motion of the paper alone, without SUMO.
 
-SUMO holds the same state to 1e-9 m (`sumo/world.py` checks that in every step).
+SUMO holds the same state to 1e-9 m (`sumo/sumo_simulation.py` checks that in every step).
 """
 
 from __future__ import annotations
@@ -13,16 +13,16 @@ from numpy.typing import NDArray
 from merge_sumo.road.corridor import Corridor
 from merge_sumo.scenario.case import FloatArray
 from merge_sumo.scenario.scenario import DT_S, Scenario
-from merge_sumo.sumo.world import PARKING_M
+from merge_sumo.sumo.sumo_simulation import PARKING_M
 
 
-class EquationWorld:
+class KinematicSimulation:
     """The state of the vehicles in `corridors` independent corridors, by eq. (4).
 
     Example:
-        world = EquationWorld(1, road_for(US23), US23)
-        world.place(0, case.starts())
-        world.command(a_mps2)
+        simulation = KinematicSimulation(1, road_for(US23), US23)
+        simulation.place(0, case.starts())
+        simulation.command(a_mps2)
 
     Attributes:
         x_m: positions, (A, corridors).
@@ -58,7 +58,7 @@ class EquationWorld:
         Args:
             corridor: the corridor.
             starts: (x in m, v in m/s) of each vehicle, in the order of rows.
-            own: for a `World` alone.
+            own: for a `SumoSimulation` alone.
         """
         self.x_m[:, corridor], self.v_mps[:, corridor] = np.array(starts).T
 

@@ -58,7 +58,7 @@ MIN_GROWTH: Final = 0.01
 """Relative growth of the coverage over the window below which a search has converged."""
 
 
-class LostError(UserError):
+class NoTrajectoryError(UserError):
     """A trajectory is missing, or its file cannot be read."""
 
 
@@ -86,7 +86,7 @@ class RecordedSettings(SharedSettings):
     pov_files: dict[str, str] | None = None
 
 
-class Run:
+class RecordedCampaign:
     """A finished or interrupted campaign, as its folder holds it.
 
     Attributes:
@@ -131,10 +131,10 @@ class Run:
         self.outcomes, self.torn = read_outcomes(text, str(path), self.scenario)
         for outcome in self.outcomes:
             needs = not (self.criterion.is_papers or outcome.measures.end.is_error)
-            if needs == outcome.is_by_score and not self.criterion.speaks_of_score:
+            if needs == outcome.is_by_score and not self.criterion.uses_score:
                 raise UserError(
                     f"case {outcome.index} in {path} is not judged by the criterion of {SETTINGS}, "
-                    f"{self.criterion.text}"
+                    f"{self.criterion.as_written}"
                 )
 
     @property
@@ -211,13 +211,15 @@ class Run:
     def trajectory(self, index: int) -> Trajectory:
         """Return the trajectory of a case.
 
-        Raises `LostError` when it is missing or unreadable, `UserError` when it is not a motion.
+        Raises:
+            NoTrajectoryError: it is missing or unreadable.
+            UserError: it is not a motion.
         """
         outcome = self.outcome(index)
         whole = self._batch(outcome.batch).get(index)
         if whole is None:
             path = batch_file(self.folder, outcome.batch)
-            raise LostError(f"{path} has no trajectory of case {index}")
+            raise NoTrajectoryError(f"{path} has no trajectory of case {index}")
         measures = outcome.measures
         motion, after = cut_at(whole, round(measures.t_end_s / DT_S))
         return Trajectory(
@@ -234,7 +236,7 @@ class Run:
         """Return the trajectories of cases by index without those that are lost; see above."""
         known = {}
         for index in indices:
-            with suppress(LostError):
+            with suppress(NoTrajectoryError):
                 known[index] = self.trajectory(index)
         return known
 
@@ -242,7 +244,7 @@ class Run:
         """Return all cases in order. Raises as `trajectory` does."""
         return [Episode(outcome, self.trajectory(outcome.index)) for outcome in self.outcomes]
 
-    def earlier(self) -> Run | None:
+    def earlier(self) -> RecordedCampaign | None:
         """Return the run of the version that this campaign is against; None where there is none.
 
         Raises `UserError` where that is missing, or has other cases. Of a campaign that was stopped
@@ -250,7 +252,7 @@ class Run:
         """
         if self.settings.against is None:
             return None
-        earlier = Run(self.folder / AGAINST)
+        earlier = RecordedCampaign(self.folder / AGAINST)
         cases = [outcome.case for outcome in self.outcomes]
         if [outcome.case for outcome in earlier.outcomes[: len(cases)]] != cases:
             raise UserError(
@@ -270,7 +272,7 @@ class Run:
         indices = [outcome.index for outcome in self.outcomes if outcome.batch == last]
         try:
             complete = sorted(self._batch(last)) == indices
-        except LostError:
+        except NoTrajectoryError:
             complete = False
         return len(self.outcomes) if complete else indices[0]
 
@@ -281,7 +283,9 @@ class Run:
             try:
                 arrays = read_arrays(path)
             except RecordError as error:
-                raise LostError(f"cannot read the trajectories in {path}: {error}") from error
+                raise NoTrajectoryError(
+                    f"cannot read the trajectories in {path}: {error}"
+                ) from error
             try:
                 motion = _motion_by_case(self.scenario.vehicles, arrays)
                 if "signals" in arrays:

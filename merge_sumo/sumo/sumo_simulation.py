@@ -42,7 +42,7 @@ from merge_sumo.sumo.binding import (
     load_libsumo,
     scratch_folder,
 )
-from merge_sumo.sumo.hosting import hosted_net, hosted_paths
+from merge_sumo.sumo.net_copies import hosted_net, hosted_paths
 
 PARKING_M = 182.0
 """Distance to M at which the vehicles of an idle corridor stand, or where their path begins."""
@@ -55,10 +55,10 @@ SLOWEST_MPS = 0.1
 
 
 class SimulationError(Exception):
-    """SUMO gave up; the world that raised it can only be restarted or closed."""
+    """SUMO gave up; the simulation that raised it can only be restarted or closed."""
 
 
-class World:
+class SumoSimulation:
     """A libsumo simulation with independent corridors; a process can have one at a time.
 
     Attributes:
@@ -68,10 +68,10 @@ class World:
         v_mps: speeds, (A, corridors).
 
     Example:
-        >>> with World(1, scenario=US23) as world:
-        ...     world.place(0, [(-300.0, 30.0), (-182.0, 18.0)])
-        ...     world.advance()
-        ...     world.command(np.zeros((2, 1)))
+        >>> with SumoSimulation(1, scenario=US23) as simulation:
+        ...     simulation.place(0, [(-300.0, 30.0), (-182.0, 18.0)])
+        ...     simulation.advance()
+        ...     simulation.command(np.zeros((2, 1)))
     """
 
     _open = False
@@ -97,10 +97,12 @@ class World:
                 the tester's own; without a `maxSpeed` they want the speed with which they start.
 
         Raises:
-            UserError: SUMO cannot start, or a world is open already.
+            UserError: SUMO cannot start, or a simulation is open already.
         """
-        if World._open:
-            raise UserError("libsumo holds one simulation per process: close the other World first")
+        if SumoSimulation._open:
+            raise UserError(
+                "libsumo holds one simulation per process: close the other SumoSimulation first"
+            )
         self.corridors = corridors
         self.road = road or road_of()
         self.vut_type, self.car_type = vut_type, car_type
@@ -167,7 +169,7 @@ class World:
         except libsumo.TraCIException as error:
             libsumo.close()
             raise UserError(f"SUMO cannot use the net {self.road.path}: {error}") from error
-        World._open = True
+        SumoSimulation._open = True
         self.read()
 
     def _enter(self, name: str, row: int, *, by_sumo: bool) -> None:
@@ -250,7 +252,7 @@ class World:
         names = [name for row in rows for name in self._ids[row * k : (row + 1) * k]]
         return np.fromiter(map(self._get_speed, names), float, len(names))
 
-    def wants_to_merge(self) -> NDArray[np.bool_]:
+    def requests_merge(self) -> NDArray[np.bool_]:
         """Return which VUTs SUMO's own lane-change models put on the mainline in its step, (K,)."""
         wants = np.zeros(self.corridors, dtype=np.bool_)
         for k, lanes in enumerate(self._lanes[POV]):
@@ -331,9 +333,9 @@ class World:
         return np.fromiter(map(get, self._ids), float, len(self._ids)).reshape(self.x_m.shape)
 
     def close(self) -> None:
-        """End the simulation; the next world may start."""
-        if World._open:
-            World._open = False
+        """End the simulation; the next simulation may start."""
+        if SumoSimulation._open:
+            SumoSimulation._open = False
             self._libsumo.close()
 
     def __enter__(self) -> Self:
