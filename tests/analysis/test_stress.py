@@ -94,8 +94,8 @@ def test_the_report_lists_robust_failures_first_where_there_is_a_stress_test(run
 
 
 def test_flips_by_hand(run):
-    failed = next(o for o in run.run.outcomes if o.failed)
-    passed = next(o for o in run.run.outcomes if o.is_tested and not o.failed)
+    failed = next(o for o in run.recorded.outcomes if o.failed)
+    passed = next(o for o in run.recorded.outcomes if o.is_tested and not o.failed)
     timeout = Outcome(0, 0, failed.case, Measures(end=End.TIMEOUT, score=-400.0))
     both = [failed, passed]
     assert flips_of(both, both) == Flips()

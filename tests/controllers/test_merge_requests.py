@@ -134,7 +134,10 @@ def test_another_answer_is_an_error_of_its_own_corridor(write_vut, answer):
 @pytest.mark.parametrize(
     ("answer", "said"),
     [
-        ("np.zeros((3, 2))", "shape (3, 2) of float64 instead of 2 numbers, or these and 2 wishes"),
+        (
+            "np.zeros((3, 2))",
+            "shape (3, 2) of float64 instead of 2 numbers, or these and 2 merge requests",
+        ),
         ("([1.0, 1.0], ['yes', 'no'])", "of <U"),
     ],
 )
@@ -158,7 +161,7 @@ def test_a_wrong_merge_request_of_a_batch_is_an_error_of_its_own_corridor(write_
 def test_a_process_that_forges_merge_requests_loses_its_episodes_and_no_more(write_vut):
     source = """
 from merge_sumo.controllers.host import HostReply, _Host
-_Host._act = lambda host, request: HostReply(accelerations_mps2=[1.0, 1.0], wishes=[7, 7])
+_Host._act = lambda host, request: HostReply(accelerations_mps2=[1.0, 1.0], merge_requests=[7, 7])
 def Vut(seen):
     return 1.0, True
 """
