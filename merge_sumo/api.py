@@ -581,52 +581,38 @@ def run_and_report(
                 config.on_case(outcome)
         check()
 
+    def on_part(title: str, unit: str, done: int, total: int) -> None:
+        bars.counted(title, done, total, unit)
+        check()
+
     count = plan.workers(_workers_for(settings, where.workers))
     try:
         with open_workers(count) as available, bars, RunningReport(folder) as report:
+            callbacks = bars.ended, report.rewrite, on_cases
+            begin = partial(bars.begin, title)
             done = run_campaign(
-                settings,
-                plan,
-                folder,
-                (bars.ended, report.rewrite, on_cases),
-                resumes=resumes,
-                workers=available,
-                begin=partial(bars.begin, title),
+                settings, plan, folder, callbacks, resumes=resumes, workers=available, begin=begin
             )
             result = CampaignRun(done, config.gates)
             study = run_study.RunStudy(done, settings, replace(plan, against=None), available)
-            _note_studies(study, bars, check)
+            counterfactuals.note_avoidance(study, partial(on_part, "careful drivers", "failures"))
+            share.note_shares(study, partial(on_part, "uniform starts", "cases"))
+            explanation.note_explanation(study)
             link_latest(folder)
             write_report(done)
     except (KeyboardInterrupt, Stopped, WorkersLostError) as stop:
         if folder.exists():
             link_latest(folder)
-            # Gates and files are not among the settings.
-            command = again(
-                "resume",
-                folder,
-                asdict(settings),
-                gates=list(config.gates) or None,
-                junit=junit,
-                workers=where.workers if isinstance(where.workers, str) else None,
-            )
+            # Gates, files and the address of a cluster are not among the settings.
+            gates = list(config.gates) or None
+            cluster = where.workers if isinstance(where.workers, str) else None
+            more = {"gates": gates, "junit": junit, "workers": cluster}
+            command = again("resume", folder, asdict(settings), **more)
             stop.add_note(f"continue with: {command}")
         raise
     if junit is not None:
         write_junit(junit, done, result.facts, result.verdict, result.gates)
     return result
-
-
-def _note_studies(study: run_study.RunStudy, bars: CampaignBars, check: Callable[[], None]) -> None:
-    """Write the studies of a campaign that has just ended."""
-
-    def on_part(title: str, done: int, total: int, unit: str) -> None:
-        bars.counted(title, done, total, unit)
-        check()
-
-    counterfactuals.note_avoidance(study, partial(on_part, "careful drivers", unit="failures"))
-    share.note_shares(study, partial(on_part, "uniform starts", unit="cases"))
-    explanation.note_explanation(study)
 
 
 def notice_povs(settings: CampaignSettings, plan: SimulationPlan, config: c.Campaign) -> None:

@@ -12,6 +12,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from functools import partial
 from typing import Final
 
 import numpy as np
@@ -25,7 +26,7 @@ from merge_sumo.printable import counted
 from merge_sumo.records import Record, read_indexed, to_json
 from merge_sumo.scenario.scenario import DT_S, OWN, VEHICLES, EpisodeTime, Vehicle
 from merge_sumo.scenario.trajectory import End, Trajectory
-from merge_sumo.simulation.evaluate import evaluate, with_measures
+from merge_sumo.simulation.evaluate import lost, simulate_part, with_measures
 from merge_sumo.simulation.plan import SimulationPlan
 from merge_sumo.workers import Workers
 
@@ -81,8 +82,11 @@ def repeat(
     if not chosen:
         return []
     found = []
-    again = evaluate(plan, [outcome.case for outcome in chosen], workers, with_measures)
-    for outcome, ran in zip(chosen, again, strict=True):
+    cases = [outcome.case for outcome in chosen]
+    job = workers.submit(
+        partial(simulate_part, plan, keep=with_measures), cases, partial(lost, plan)
+    )
+    for outcome, ran in zip(chosen, workers.collect(job), strict=True):
         if not ran.outcome.measures.end.is_error:  # of a slow machine, perhaps
             found.append(repeat_of(outcome, run.trajectory(outcome.index), ran))
     found.sort(key=lambda one: one.index)
