@@ -139,7 +139,7 @@ class CampaignRun(Result):
 
     @property
     def regressions(self) -> Table:
-        """The cases that do not pass, and pass with that version, the worst first."""
+        """The cases that broke, the worst first: they pass with the earlier version alone."""
         cases = [] if self.against is None else self.against.steps[0].cases
         broke = [case.b.index for case in cases if case.change is Change.BROKE]
         return Table(self.recorded.outcome(index) for index in broke)

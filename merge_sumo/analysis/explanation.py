@@ -78,9 +78,10 @@ class Axis(Record, frozen=True):
         return float(10.0**self.digits)
 
     def grid(self, sign: int) -> list[int]:
-        """Return the values of one side in units, from the failure's on, which is rounded to it.
+        """Return the grid on one side of the failure's value, in units of the last digit.
 
-        Empty where the range ends there.
+        It begins with the failure's value, rounded away from that side. It is empty where the
+        range ends there.
         """
         # A whole number of units may be off by a rounding error.
         own = math.floor(sign * self.value * self.scale + 1e-6)

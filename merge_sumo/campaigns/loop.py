@@ -1,7 +1,8 @@
 """The loop of a campaign: it asks, submits, collects, stores, tells.
 
 Cases are proposed in groups. Those whose outcomes the sampler was not told yet are pending. Before
-the sampler is asked again it is told the oldest groups, of as few as leave room for the next:
+the loop asks the sampler again, it tells it the oldest groups, only those that make room for the
+next one:
 
     a batch       waits for the one before
     in flight     N cases may be pending, in groups of a third, of a sampler that `overlaps`
@@ -33,7 +34,7 @@ from merge_sumo.workers import MAX_CHUNK, Job, Workers
 GROUPS: Final = 3
 """Groups in flight: the sampler is asked for one while the cases of others keep workers busy."""
 AGE: Final = 16
-"""Cases for each of which one more may be in flight than the sampler wants in a batch."""
+"""For each AGE cases that were proposed, one more case may be in flight."""
 AHEAD_S = 0.5
 """Seconds of work for each worker that are submitted together, where the sampler does not learn."""
 

@@ -27,7 +27,7 @@ ROUNDING_MPS = 1e-6
 
 
 class Kind(StrEnum):
-    """Kinds of failures under the paper's rule; each such failure is of exactly one."""
+    """Kinds of failures under the paper's criterion; each of these failures has one kind."""
 
     STALEMATE = "stalemate"
     SQUEEZE = "squeeze"

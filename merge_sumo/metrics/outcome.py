@@ -29,11 +29,11 @@ Chance = Annotated[float, Meta(ge=0.0, le=1.0)]
 
 
 class Prediction(Record, frozen=True):
-    """What was predicted of a case before it ran: gaps at M and the failure probability.
+    """The prediction of a case before it ran: gaps at M and the failure probability.
 
     Attributes:
-        dx_m: signed gaps at M, (E, G), in m: G rollouts of each of E members of the ensemble that
-            models the controller; None where the VUT never arrived.
+        dx_m: signed gaps at M, (1, M), in m: one for each of the M members of the model of the
+            controller (`twin` in files); None where the VUT never arrived.
         p_twin: failure probability by these gaps.
         p_surrogate: failure probability by the surrogate of the outcomes.
         p_fail: failure probability by both.
@@ -49,7 +49,7 @@ class Prediction(Record, frozen=True):
         """Return a rounded prediction.
 
         Args:
-            dx_m: signed gaps at M, (E, G), in m; NaN where the VUT never arrived.
+            dx_m: signed gaps at M, (1, M), in m; NaN where the VUT never arrived.
             p_twin: failure probability by the gaps.
             p_surrogate: failure probability by the surrogate.
             p_fail: failure probability by both.
@@ -62,7 +62,7 @@ class Prediction(Record, frozen=True):
 
     @property
     def gaps_m(self) -> FloatArray:
-        """The gaps, (E, G), in m; NaN where the VUT never arrived."""
+        """The gaps, (1, M), in m; NaN where the VUT never arrived."""
         return np.array(self.dx_m, dtype=np.float64)
 
     def __post_init__(self) -> None:

@@ -55,7 +55,7 @@ def margins(gap: FloatArray) -> FloatArray:
 
 
 def regression_gaps(new: FloatArray, old: FloatArray) -> FloatArray:
-    """Return what stands for the gap of a regression, (...), by the signed gaps of both versions.
+    """Return the signed gap of a regression, (...), from the signed gaps of both versions.
 
     It is `Outcome.signed_gap` of `regression`: within 1 for a regression, with the sign of the new
     version's gap.

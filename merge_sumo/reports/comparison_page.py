@@ -73,10 +73,10 @@ def _maps(step: Step) -> dict[int, Any]:
 
 
 def _sections(step: Step, compared: Comparison) -> list[tuple[Change, int, Any]]:
-    """Return each change with the number of its cases, and the picture of the first of them.
+    """Return a section for each change: the change, its number of cases, a row for each case shown.
 
-    Of a case: its change; by version the number, folder, outcome, and cause; the charts; the time
-    from which on the motions differ.
+    A row has the case, its versions (number, folder, outcome, cause), the charts, and the time of
+    the first difference of the motions.
     """
     sections, left = [], SHOWN
     for change in DRAWN:
