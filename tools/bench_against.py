@@ -29,7 +29,7 @@ from oracle import greedy_cover
 from merge_sumo.analysis.sampler_study import search
 from merge_sumo.analysis.truth import ground_truth
 from merge_sumo.campaigns.campaign import controller_model_of
-from merge_sumo.campaigns.loop import Groups, SearchLoop
+from merge_sumo.campaigns.loop import Batches, SearchLoop
 from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.metrics.fmc import covered
@@ -105,7 +105,7 @@ class Versions:
             controller_model_of(self.old, settings.pool, seed),
         )
         sampler = make_sampler(settings.sampler, settings.pool, seed, models)
-        groups: Groups = []
+        groups: Batches = []
         SearchLoop(sampler, self.both, cases).run(groups.extend)
         return self._points(
             one.outcome.case

@@ -48,7 +48,7 @@ from problems import (
 )
 
 from merge_sumo.campaigns.campaign import controller_model_of
-from merge_sumo.campaigns.loop import Groups, SearchLoop
+from merge_sumo.campaigns.loop import Batches, SearchLoop
 from merge_sumo.errors import UserError
 from merge_sumo.files import check_own, make_folder, regular, replace_own
 from merge_sumo.metrics.fmc import fmc
@@ -161,7 +161,7 @@ def run_searches(searches: Sequence[Search], limit_s: float) -> list[Found]:
 def _run_search(search: Search, watch: Watch) -> Found:
     problem, plan = _problem(search.problem)
     pool, fault = problem.settings().pool, None
-    groups: Groups = []
+    groups: Batches = []
 
     def make() -> Any:
         sampler, model = sampler_class(search.sampler), None

@@ -25,7 +25,7 @@ from merge_sumo.analysis.truth import (
     known_truth,
 )
 from merge_sumo.campaigns.campaign import controller_model_of
-from merge_sumo.campaigns.loop import Groups, SearchLoop
+from merge_sumo.campaigns.loop import Batches, SearchLoop
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.controllers.in_memory import is_in_process
 from merge_sumo.errors import UserError, notice
@@ -100,7 +100,7 @@ def search(
     for name, seed in tasks:
         sampler = make_sampler(name, pool, seed, controller_model_of(plan, pool, seed))
         size = batch or (None if sampler.uses_predictions else COMPARED_BATCH)
-        groups: Groups = []
+        groups: Batches = []
         SearchLoop(sampler, plan, cases, batch=size).run(groups.extend)
         found = SamplerRun([], [])
         for group in groups:

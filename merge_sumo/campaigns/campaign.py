@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from merge_sumo.campaigns.journal import Journal
-from merge_sumo.campaigns.loop import Groups, SearchLoop
+from merge_sumo.campaigns.loop import Batches, SearchLoop
 from merge_sumo.campaigns.recorded import AGAINST, FILES, TALLIES, RecordedCampaign, spread_failures
 from merge_sumo.campaigns.repeats import repeat
 from merge_sumo.campaigns.settings import CampaignSettings, record_of
@@ -89,7 +89,7 @@ def run_campaign(
             journal = _created(settings, plan, folder, opened)
         begin([episode.outcome for episode in history])
 
-        def on_groups(groups: Groups) -> None:
+        def on_batches(groups: Batches) -> None:
             journal.append(*groups)
             stored = [episode.outcome for group in groups for episode in group]
             for callback in callbacks:
@@ -106,7 +106,7 @@ def run_campaign(
             stop=settings.stopping_rule(),
             history=history,
         )
-        loop.run(on_groups)
+        loop.run(on_batches)
         done = RecordedCampaign(folder)
         if plan.earlier is not None:
             repeat(RecordedCampaign(folder / AGAINST), settings.earlier, plan.earlier, available)

@@ -1,15 +1,15 @@
 """The loop of a campaign: it asks, submits, collects, stores, tells.
 
-Cases are proposed in groups. Those whose outcomes the sampler was not told yet are pending. Before
-the loop asks the sampler again, it tells it the oldest groups, only those that make room for the
+Cases are proposed in batches. Those whose outcomes the sampler was not told yet are pending. Before
+the loop asks the sampler again, it tells it the oldest batches, only those that make room for the
 next one:
 
     a batch       waits for the one before
-    in flight     N cases may be pending, in groups of a third, of a sampler that `overlaps`
+    in flight     N cases may be pending, in batches of a third, of a sampler that `overlaps`
     ahead         a sampler that does not learn is asked long before its cases run
 
-What a group depends on follows from settings and outcomes, and neither from the number of workers
-nor from the time that a case takes. Groups that a journal has are told again, and do not run.
+What a batch depends on follows from settings and outcomes, and neither from the number of workers
+nor from the time that a case takes. Batches that a journal has are told again, and do not run.
 """
 
 from __future__ import annotations
@@ -31,33 +31,33 @@ from merge_sumo.simulation.evaluate import lost, simulate_part, with_measures
 from merge_sumo.simulation.plan import SimulationPlan
 from merge_sumo.workers import MAX_CHUNK, Job, Workers
 
-GROUPS: Final = 3
-"""Groups in flight: the sampler is asked for one while the cases of others keep workers busy."""
+BATCHES_IN_FLIGHT: Final = 3
+"""Batches in flight: the sampler is asked for one while the cases of others keep workers busy."""
 AGE: Final = 16
 """For each AGE cases that were proposed, one more case may be in flight."""
 AHEAD_S = 0.5
 """Seconds of work for each worker that are submitted together, where the sampler does not learn."""
 
-Groups = list[list[Episode]]
-"""The episodes of groups that were submitted together."""
+Batches = list[list[Episode]]
+"""The episodes of batches that were submitted together."""
 
 
 @dataclass(slots=True)
-class _Group:
+class _Batch:
     """Cases that were proposed together, and their episodes when they have run."""
 
     number: int
-    first: int
+    first_index: int
     cases: Sequence[Case]
     predictions: Sequence[Prediction | None] = ()
     episodes: list[Episode] = field(default_factory=list)
 
 
 class SearchLoop:
-    """Keeps groups of cases in flight, and tells a sampler their outcomes in order.
+    """Keeps batches of cases in flight, and tells a sampler their outcomes in order.
 
     Example:
-        SearchLoop(make_sampler("uniform", pool, seed), plan, 100).run(on_groups)
+        SearchLoop(make_sampler("uniform", pool, seed), plan, 100).run(on_batches)
     """
 
     def __init__(
@@ -80,130 +80,134 @@ class SearchLoop:
             plan: how they run.
             cases: number of cases after which the search ends.
             workers: where they run; by default in this process, whose simulator stays open.
-            batch: cases of a group; by default the number that the sampler wants.
-            draws: runs of each case that the sampler proposes. All are in one group.
-            in_flight: most cases in flight; by default one group.
+            batch: cases of a batch; by default the number that the sampler wants.
+            draws: runs of each case that the sampler proposes. All are in one batch.
+            in_flight: most cases in flight; by default one batch.
             stop: whether the outcomes with a verdict end the search.
-            history: whole groups that ran before, in order.
+            history: whole batches that ran before, in order.
         """
-        self._sampler, self._cases, self._stop = sampler, cases, stop
+        self._sampler, self._until, self._stop = sampler, cases, stop
         self._simulate = partial(simulate_part, plan, keep=with_measures)
         self._lost = partial(lost, plan)
         self._workers = Workers() if workers is None else workers
-        self._batch, self._draws, self._in_flight = batch, draws, in_flight
+        self._batch_size, self._draws, self._in_flight = batch, draws, in_flight
         self._ahead = not sampler.learns and stop is None
         self._overlaps = in_flight is not None and sampler.overlaps
-        groups = groupby(history, key=lambda episode: episode.outcome.batch)
-        self._history = deque(list(group) for _, group in groups)
-        self._pending: list[_Group] = []
-        self._proposed = self._ran = 0
-        self._groups = 0
+        batches = groupby(history, key=lambda episode: episode.outcome.batch)
+        self._history = deque(list(batch) for _, batch in batches)
+        self._pending: list[_Batch] = []
+        self._cases_proposed = self._cases_ran = 0
+        self._batches_proposed = 0
         self._start_s = time.perf_counter()
 
-    def run(self, on_groups: Callable[[Groups], None]) -> None:
+    def run(self, on_batches: Callable[[Batches], None]) -> None:
         """Ask, run, store and tell until all cases have run.
 
         Args:
-            on_groups: stores groups whose cases have run, before the sampler is told; may raise to
-                stop the search.
+            on_batches: stores batches whose cases have run, before the sampler is told; may raise
+                to stop the search.
         """
-        running: deque[tuple[list[_Group], Job[Case, Episode] | None]] = deque()
+        running: deque[tuple[list[_Batch], Job[Case, Episode] | None]] = deque()
         while True:
-            while self._has_room(len(running)) and (groups := self._ask()):
+            while self._has_room(len(running)) and (batches := self._ask()):
                 job = None
-                if not groups[0].episodes:
-                    cases = [case for group in groups for case in group.cases]
+                if not batches[0].episodes:
+                    cases = [case for batch in batches for case in batch.cases]
                     job = self._workers.submit(self._simulate, cases, self._lost)
-                running.append((groups, job))
+                running.append((batches, job))
             if not running:
                 return
-            groups, job = running.popleft()
+            batches, job = running.popleft()
             if job is not None:
-                self._collect(groups, job)
-                on_groups([group.episodes for group in groups])
-            for group in groups:
-                tell(self._sampler, group.episodes)
-            del self._pending[: len(groups)]
+                self._collect(batches, job)
+                on_batches([batch.episodes for batch in batches])
+            for batch in batches:
+                tell(self._sampler, batch.episodes)
+            del self._pending[: len(batches)]
             self._pend()
 
     def _has_room(self, running: int) -> bool:
-        """Return whether the sampler is asked before it is told the oldest group."""
+        """Return whether the sampler is asked before it is told the oldest batch."""
         if self._ahead:
-            return running < GROUPS
+            return running < BATCHES_IN_FLIGHT
         if self._overlaps and running:
-            pending = sum(len(group.cases) for group in self._pending)
-            return pending + self._size() <= self._most()
+            pending = sum(len(batch.cases) for batch in self._pending)
+            return pending + self._next_size() <= self._most_in_flight()
         return not running
 
-    def _ask(self) -> list[_Group]:
-        """Return the groups to submit next; none where the search has ended."""
+    def _ask(self) -> list[_Batch]:
+        """Return the batches to submit next; none where the search has ended."""
         if self._history:
             known = self._history.popleft()
             cases = [episode.outcome.case for episode in known]
-            return [self._add(_Group(self._groups, self._proposed, cases, episodes=known))]
+            first = self._cases_proposed
+            return [self._add(_Batch(self._batches_proposed, first, cases, episodes=known))]
         if self._stop is not None and self._stop(self._sampler.observed()):
-            self._cases = self._proposed
-        end = min(self._cases, self._proposed + self._cases_ahead())
-        groups = []
-        while self._proposed < end:
+            self._until = self._cases_proposed
+        end = min(self._until, self._cases_proposed + self._cases_ahead())
+        batches = []
+        while self._cases_proposed < end:
             cases, predictions = [], []
-            for place, case in enumerate(self._sampler.ask(max(1, self._size() // self._draws))):
+            size = max(1, self._next_size() // self._draws)
+            for place, case in enumerate(self._sampler.ask(size)):
                 for draw in range(self._draws):
                     cases.append(replace(case, draw=draw))
                     predictions.append(None if draw else self._sampler.prediction(place))
-            left = self._cases - self._proposed
-            group = _Group(self._groups, self._proposed, cases[:left], predictions[:left])
-            groups.append(self._add(group))
-        return groups
+            left = self._until - self._cases_proposed
+            batch = _Batch(
+                self._batches_proposed, self._cases_proposed, cases[:left], predictions[:left]
+            )
+            batches.append(self._add(batch))
+        return batches
 
     def _cases_ahead(self) -> int:
         """Return how many cases are submitted together at least: more where workers are quick."""
         if not self._ahead:
             return 1
-        rate = self._ran / (time.perf_counter() - self._start_s)
+        rate = self._cases_ran / (time.perf_counter() - self._start_s)
         return max(1, min(round(AHEAD_S * rate), MAX_CHUNK * self._workers.count))
 
-    def _size(self) -> int:
-        """Return the number of cases of the next group."""
+    def _next_size(self) -> int:
+        """Return the number of cases of the next batch."""
         if self._history:
             return len(self._history[0])
         if self._in_flight is None:
-            size = self._batch or self._sampler.batch_size()
+            size = self._batch_size or self._sampler.batch_size()
         elif self._overlaps:
-            size = max(1, self._most() // GROUPS)
+            size = max(1, self._most_in_flight() // BATCHES_IN_FLIGHT)
         else:
-            size = self._most()
-        return min(size, self._cases - self._proposed)
+            size = self._most_in_flight()
+        return min(size, self._until - self._cases_proposed)
 
-    def _most(self) -> int:
+    def _most_in_flight(self) -> int:
         """Return how many cases may be in flight by now.
 
         Fewer than N in a young search: the less is known, the more is the next outcome worth.
         """
         assert self._in_flight is not None, "N is given"  # noqa: S101
-        return min(self._in_flight, self._sampler.batch_size() + self._proposed // AGE)
+        return min(self._in_flight, self._sampler.batch_size() + self._cases_proposed // AGE)
 
-    def _add(self, group: _Group) -> _Group:
-        """Count a group as proposed."""
-        self._groups += 1
-        self._proposed += len(group.cases)
-        self._pending.append(group)
+    def _add(self, batch: _Batch) -> _Batch:
+        """Count a batch as proposed."""
+        self._batches_proposed += 1
+        self._cases_proposed += len(batch.cases)
+        self._pending.append(batch)
         self._pend()
-        return group
+        return batch
 
     def _pend(self) -> None:
-        self._sampler.pend([case for group in self._pending for case in group.cases])
+        self._sampler.pend([case for batch in self._pending for case in batch.cases])
 
-    def _collect(self, groups: Sequence[_Group], job: Job[Case, Episode]) -> None:
-        """Collect the episodes of groups; note which ran again because a worker had died."""
+    def _collect(self, batches: Sequence[_Batch], job: Job[Case, Episode]) -> None:
+        """Collect the episodes of batches; note which ran again because a worker had died."""
         episodes = self._workers.collect(job)
-        self._ran += len(episodes)
+        self._cases_ran += len(episodes)
         for place in job.retried:
             episodes[place] = replace(episodes[place], again=True)
         rest = iter(episodes)
-        for group in groups:
-            for index, prediction in enumerate(group.predictions, group.first):
-                group.episodes.append(next(rest).at(index, group.number, prediction))
+        for batch in batches:
+            for index, prediction in enumerate(batch.predictions, batch.first_index):
+                batch.episodes.append(next(rest).at(index, batch.number, prediction))
 
 
 def tell(sampler: Sampler, episodes: Sequence[Episode]) -> None:

@@ -14,7 +14,7 @@ from support.campaigning import campaign_settings, run_campaign
 from support.plans import plan_for
 
 from merge_sumo.campaigns.journal import to_line
-from merge_sumo.campaigns.loop import AGE, GROUPS, SearchLoop
+from merge_sumo.campaigns.loop import AGE, BATCHES_IN_FLIGHT, SearchLoop
 from merge_sumo.campaigns.recorded import OUTCOMES, TRAJECTORIES
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.errors import UserError
@@ -111,8 +111,8 @@ class TestRoom:
             most = min(24, 6 + (told + pending) // AGE)
             assert pending + n <= most
             # No more is told than has to be.
-            assert not told or pending + n > most - most // GROUPS
-        assert {n for n, *_ in asked if n > 1} > {2, 24 // GROUPS}
+            assert not told or pending + n > most - most // BATCHES_IN_FLIGHT
+        assert {n for n, *_ in asked if n > 1} > {2, 24 // BATCHES_IN_FLIGHT}
 
     def test_is_for_several_groups_where_outcomes_decide_nothing(self, monkeypatch):
         monkeypatch.setattr(Asked, "learns", False)
