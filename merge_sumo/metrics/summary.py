@@ -114,8 +114,12 @@ def one_per_case(outcomes: Iterable[Outcome], tolerated: float = 0.0) -> list[Ou
     known = list(outcomes)
     if not any(outcome.case.draw for outcome in known):
         return known
-    shown = {case.outcomes[0].index: case.deciding(tolerated) for case in by_case(known)}
-    shown |= {outcome.index: outcome for outcome in known if outcome.margin is None}
+    shown: dict[int, Outcome] = {}
+    for case in by_case(known):
+        shown[case.outcomes[0].index] = case.deciding(tolerated)
+    for outcome in known:
+        if outcome.margin is None:
+            shown[outcome.index] = outcome
     return [shown[index] for index in sorted(shown)]
 
 

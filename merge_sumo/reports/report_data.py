@@ -153,11 +153,13 @@ def _search(model: ReportModel) -> dict[str, Any]:
     steps = [outcomes * step // 20 for step in range(21)]
     levels = []
     for level in model.levels:
-        failures = [o for o in model.worst if o.case.level == level]
-        failures.sort(key=lambda outcome: outcome.index)
-        points = to_unit([o.case for o in failures], level, model.run.scenario)
-        growth = np.concatenate([[0.0], fmc_growth(points)])
-        found = np.searchsorted([o.index for o in failures], steps)
+        cases, indices = [], []
+        for outcome in sorted(model.worst, key=lambda outcome: outcome.index):
+            if outcome.case.level == level:
+                cases.append(outcome.case)
+                indices.append(outcome.index)
+        growth = np.concatenate([[0.0], fmc_growth(to_unit(cases, level, model.run.scenario))])
+        found = np.searchsorted(indices, steps)
         levels.append({"level": level, "fmc": growth[found].round(5).tolist()})
     return {"cases": steps, "levels": levels}
 

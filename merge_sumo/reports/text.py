@@ -460,9 +460,11 @@ def robustness(found: StressResult) -> str:
     fragile = list(filter(found.passes_in, found.failures))
     if fragile:
         fragile.sort(key=found.passes_in, reverse=True)
-        shown = ", ".join(f"{index} ({found.passes_in(index)})" for index in fragile[:FRAGILE])
+        shown = []
+        for index in fragile[:FRAGILE]:
+            shown.append(f"{index} ({found.passes_in(index)})")
         text += "; others, with the number of runs in which they do not fail"
-        text += f"{cut(len(fragile), FRAGILE)}: {shown}"
+        text += f"{cut(len(fragile), FRAGILE)}: {', '.join(shown)}"
     return text
 
 
