@@ -581,10 +581,6 @@ def run_and_report(
                 config.on_case(outcome)
         check()
 
-    def on_part(title: str, unit: str, done: int, total: int) -> None:
-        bars.counted(title, done, total, unit)
-        check()
-
     count = plan.workers(_workers_for(settings, where.workers))
     try:
         with open_workers(count) as available, bars, RunningReport(folder) as report:
@@ -595,6 +591,7 @@ def run_and_report(
             )
             result = CampaignRun(done, config.gates)
             study = run_study.RunStudy(done, settings, replace(plan, against=None), available)
+            on_part = partial(_count, bars, check)
             counterfactuals.note_avoidance(study, partial(on_part, "careful drivers", "failures"))
             share.note_shares(study, partial(on_part, "uniform starts", "cases"))
             explanation.note_explanation(study)
@@ -613,6 +610,14 @@ def run_and_report(
     if junit is not None:
         write_junit(junit, done, result.facts, result.verdict, result.gates)
     return result
+
+
+def _count(
+    bars: CampaignBars, check: Callable[[], None], title: str, unit: str, done: int, total: int
+) -> None:
+    """Show the progress of a study, and stop it where the user has asked for that."""
+    bars.counted(title, done, total, unit)
+    check()
 
 
 def notice_povs(settings: CampaignSettings, plan: SimulationPlan, config: c.Campaign) -> None:

@@ -203,6 +203,18 @@ def campaign(
     ] = None,
     json: Json = False,
 ) -> int:
+    """Run a campaign, or continue one, and print its result.
+
+    Args:
+        vut: the vehicle under test.
+        config: the other options.
+        resume: folder of the campaign that continues.
+        out: new folder.
+        json: whether the result is printed as JSON.
+
+    Returns:
+        The exit code.
+    """
     if resume is not None and out is not None:
         raise UserError("--resume names the folder: leave --out away")
     with stoppable() as check:
@@ -232,6 +244,18 @@ def run(
     ] = None,
     json: Json = False,
 ) -> int:
+    """Run a case and print its motion.
+
+    Args:
+        vut: the vehicle under test.
+        config: the other options.
+        at: coordinates of the case, as NAME=NUMBER.
+        json: whether the result is printed as JSON.
+
+    Returns:
+        The exit code.
+    """
+
     def ended(result: CaseRun) -> None:
         print_result(result, json, **({"out": config.out} if json else {}))
         if config.out is not None and not json:
@@ -280,6 +304,16 @@ def replay(
     gui: Annotated[bool, Parameter(help="Open it in sumo-gui.")] = False,
     json: Json = False,
 ) -> int:
+    """Replay a case in SUMO and print the comparison, or open it in sumo-gui.
+
+    Args:
+        config: the case and its folder.
+        gui: whether sumo-gui opens it.
+        json: whether the result is printed as JSON.
+
+    Returns:
+        The exit code.
+    """
     if gui:
         return ms.open_in_gui(**vars(config))
     return print_result(ms.replay(**vars(config)), json)
@@ -311,6 +345,16 @@ def rerun(
     ] = False,
     json: Json = False,
 ) -> int:
+    """Run recorded cases again, with another VUT or a changed simulation, and print the changes.
+
+    Args:
+        config: the cases and the VUT.
+        stress: whether the simulation changes, and not the VUT.
+        json: whether the result is printed as JSON.
+
+    Returns:
+        The exit code.
+    """
     if not stress:
         result = ms.rerun(**vars(config))
         page = {"page" if result.text is None else "cases": config.out}

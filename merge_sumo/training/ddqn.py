@@ -145,7 +145,13 @@ class _Games:
             self._begin(again)
 
     def loss(self, online: nn.Sequential, target: nn.Sequential, batch: int) -> Tensor:
-        """Return the loss of the online network on some transitions."""
+        """Return the loss of the online network on some transitions.
+
+        Args:
+            online: the network that learns.
+            target: the network that rates the best next action.
+            batch: number of transitions.
+        """
         rows = self.transitions[self.rng.integers(0, self.filled, batch)]
         before, after = rows["before"], rows["after"]
         svo_rad: np.ndarray = np.zeros(batch, dtype=np.float32)

@@ -65,7 +65,13 @@ class GamePicture:
         centre = (fronts.min(axis=0) + fronts.max(axis=0)) / 2.0
 
         def draw(colour: str, points: FloatArray, line_m: float) -> FloatArray:
-            """Draw a line on the road; return its points in pixels."""
+            """Draw a line on the road; return its points in pixels.
+
+            Args:
+                colour: #RRGGBB.
+                points: in m, (n, 2).
+                line_m: width of the line.
+            """
             pixels: FloatArray = np.array(SIZE_PX) / 2.0 + (points - centre) * [scale, -scale]
             self._pygame.draw.lines(canvas, colour, False, pixels, max(round(line_m * scale), 1))
             return pixels
