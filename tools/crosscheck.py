@@ -248,7 +248,7 @@ def main() -> int:
     options = parser.parse_args()
     try:
         peer = f"HighwayEnv {version('highway-env')}"
-        found = crosscheck(ms.open_run(options.recorded).recorded, options.cases, options.seed)
+        found = crosscheck(ms.open_run(options.run).recorded, options.cases, options.seed)
     except ImportError:
         print("this needs highway-env: run `pip install 'merge-sumo[peers]'`", file=sys.stderr)
         return 2
