@@ -222,19 +222,20 @@ class Pair:
 class Drive:
     """A session and a SUMO program in which the VUT drives as it is commanded, step by step.
 
-    The session's VUT is moved by eq. (4) and the scenario's limits. Both start anew in `begin`, but
-    for the programs.
+    The session's VUT is moved by eq. (4) and the scenario's limits. Both start again in `begin`.
     """
 
     def __init__(self, folder: Path) -> None:
         self.road, self.folder = road_of(), folder
         write_files(folder, self.road, US23)
-        self.process, self.real = open_program(folder)
+        self.process: subprocess.Popen[bytes] | None = None
 
     def begin(self, pov: tuple[float, float] = (-250.0, 30.0)) -> None:
         """Let the vehicles depart; `pov` is (x in m, v in m/s) of the session's POV."""
         self.restart(pov)
-        self.real.load(_options(self.folder))
+        # A program of its own for each test: one that ends takes no other test with it.
+        self._end_program()
+        self.process, self.real = open_program(self.folder)
         self.real.route.add("route.vut", edges_of(self.road.ramp))
         vehicle = self.real.vehicle
         vehicle.add("vut", "route.vut", typeID="vut", departSpeed="18")
@@ -272,7 +273,12 @@ class Drive:
 
     def close(self) -> None:
         close_mirror()
-        end_program(self.process)
+        self._end_program()
+
+    def _end_program(self) -> None:
+        if self.process is not None:
+            end_program(self.process)
+            self.process = None
 
 
 def questions() -> Iterator[tuple[str, str, tuple[Any, ...]]]:
