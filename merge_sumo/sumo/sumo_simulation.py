@@ -197,11 +197,12 @@ class SumoSimulation:
             lane, start_m = self._lane_at(row, corridor, x)
             own_type = self.vut_type if row == VUT else self.car_type
             by_sumo = own_type is not None and (row == VUT or own)
-            # A new vehicle: some of SUMO's models remember how they drove, and its lane-change
-            # model remembers messages to the cars next to it.
-            self._remove(name)
-            self._enter(name, row, by_sumo=by_sumo)
-            self._by_sumo[row, corridor] = by_sumo
+            if by_sumo or self._by_sumo[row, corridor] or self._lane_changes:
+                # A new vehicle: some of SUMO's models remember how they drove, and its lane-change
+                # model remembers messages to the cars next to it.
+                self._remove(name)
+                self._enter(name, row, by_sumo=by_sumo)
+                self._by_sumo[row, corridor] = by_sumo
             self._move_to(name, lane, x - start_m)
             self._set_previous_speed(name, v, 0.0)
             if not by_sumo:
