@@ -62,15 +62,21 @@ class NoTrajectoryError(UserError):
     """A trajectory is missing, or its file cannot be read."""
 
 
+ControllerText = Annotated[
+    str, Meta(max_length=10_000, description="a text of at most 10,000 characters")
+]
+"""The name of a controller, which pages and tables repeat."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class SharedSettings(Search):
     """Settings that a campaign needs to run and a reader needs to show it."""
 
-    vut: str = "None"
+    vut: ControllerText = "None"
     levels: tuple[Annotated[int, Meta(ge=min(ALL_LEVELS), le=max(ALL_LEVELS))], ...] = ()
     cases: int = MOST_CASES
-    pov: str | None = None
-    against: str | None = None
+    pov: ControllerText | None = None
+    against: ControllerText | None = None
     fail_when: str = PAPER_CRITERION.fail_when
     require: str | None = None
 

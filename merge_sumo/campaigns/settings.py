@@ -12,6 +12,7 @@ from merge_sumo.campaigns.again import CONTROLLERS
 from merge_sumo.campaigns.recorded import (
     NAME_CHARACTERS,
     SETTINGS,
+    ControllerText,
     SharedSettings,
     has_converged,
     scenario_of,
@@ -46,7 +47,7 @@ from merge_sumo.simulation.povs import POLICIES
 class CampaignSettings(SharedSettings):
     """Everything that decides the outcomes of a campaign; `UserError` for wrong values."""
 
-    vut: str
+    vut: ControllerText
     levels: tuple[int, ...]
     scenario: Scenario
     policies: str | None = None

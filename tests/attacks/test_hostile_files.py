@@ -5,6 +5,7 @@ Each row of the table changes one thing in an honest file. SUMO itself is real.
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import shutil
@@ -119,6 +120,16 @@ def truth(save: Callable[..., object] = np.savez, **changes: object) -> Change:
     return change
 
 
+def named(vut: str) -> Change:
+    """Give the controller of a campaign a name."""
+
+    def change(path: Path) -> None:
+        settings = json.loads(path.read_text())
+        path.write_text(json.dumps(settings | {"vut": vut}))
+
+    return change
+
+
 NET = "net.xml"
 TRUTH = KEPT.path(Path()).name
 LAUGHS = "".join(f"<!ENTITY a{n} '{f'&a{n - 1};' * 10}'>" for n in range(1, 10))
@@ -145,6 +156,7 @@ ATTACKS = {
     "UTF-16": (RECORD, in_utf_16, play, "save it as UTF-8"),
     "far time": (RECORD, instead('time="0.10"', 'time="9e99"'), play, "missing or wrong value"),
     # Not the file that it seems.
+    "long name": (SETTINGS, named("<script>" * 10**6), export, "a text of at most 10,000"),
     "pipe of settings": (SETTINGS, pipe, export, "it is not a file"),
     "pipe of outcomes": (OUTCOMES, pipe, export, "it is not a file"),
     "pipe of motion": (f"{TRAJECTORIES}/00000.npz", pipe, export, "it is not a file"),
