@@ -39,7 +39,7 @@ from merge_sumo.training.reward import Reward
 
 
 class MergesAt(Level0Vut):
-    """The level-0 profile, with a wish to merge from a place on."""
+    """The level-0 profile, with a merge request from a place on."""
 
     def __init__(self, corridors: int, place_m: float) -> None:
         """Take the place."""

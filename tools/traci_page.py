@@ -39,7 +39,7 @@ scenario's limits. `vut` departs with its speed set, so a controller without com
 speed. Speed mode 31, `setSpeed(-1)`, `setTau`, `openGap` and `setStop` have their \
 meaning in SUMO, whose car-following model then drives the VUT (deterministically: `sigma` is 0, \
 unless `setImperfection` changes it). On a road with an acceleration lane the lane that the step \
-gives the VUT is its wish to merge; `vut` departs in lane change mode 0, so nothing but the \
+gives the VUT is its merge request; `vut` departs in lane change mode 0, so nothing but the \
 controller changes its lane ([Lane changes](../tutorials/traci-controller.md#lane-changes)).
 
 `setPreviousSpeed` and `moveToXY` say what [a vehicle model of the controller's own]\
