@@ -14,13 +14,13 @@ from typing import Any
 import pytest
 from support.calling import Said
 from support.campaigning import campaign_settings, run_campaign
-from support.foreign_nets import corridor_of
+from support.foreign_nets import foreign_road
 from threadpoolctl import threadpool_limits
 
 from merge_sumo import cli
 from merge_sumo.analysis import share
 from merge_sumo.campaigns.recorded import RecordedCampaign
-from merge_sumo.road.corridor import Corridor
+from merge_sumo.road.road import Road
 from merge_sumo.simulation import evaluate
 
 MOUNT, UMOUNT = shutil.which("mount"), shutil.which("umount")
@@ -77,13 +77,13 @@ def run(tmp_path_factory) -> RecordedCampaign:
 
 
 @pytest.fixture(scope="session")
-def corridor(tmp_path_factory):
-    """Return a function that builds a foreign net once and gives its corridor."""
+def built_road(tmp_path_factory):
+    """Return a function that builds a foreign net once and gives its road."""
     built = {}
 
-    def get(name: str) -> Corridor:
+    def get(name: str) -> Road:
         if name not in built:
-            built[name] = corridor_of(name, tmp_path_factory.mktemp("net"))
+            built[name] = foreign_road(name, tmp_path_factory.mktemp("net"))
         return built[name]
 
     return get

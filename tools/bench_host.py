@@ -28,7 +28,7 @@ from measuring import append_record, benchmark_parser, spread
 from merge_sumo.controllers.kinds import load
 from merge_sumo.drivers.base import Driver, Scene
 from merge_sumo.drivers.policies import policies_of
-from merge_sumo.road.merge import road_of
+from merge_sumo.road.loader import road_of
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.scenario.case import Case, from_unit
 from merge_sumo.scenario.scenario import DT_S, US23, VEHICLES, Scenario

@@ -25,7 +25,7 @@ from merge_sumo.drivers.lane import PovAfterMerge, acc_mps2, idm_mps2
 from merge_sumo.drivers.level0 import Level0Pov, Level0Vut
 from merge_sumo.drivers.policies import load_driver
 from merge_sumo.metrics.merge import brake_after_mps2
-from merge_sumo.road.merge import road_for
+from merge_sumo.road.loader import road_for
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.scenario.case import Case, FloatArray, from_unit
 from merge_sumo.scenario.scenario import DT_S, US23, Bounds

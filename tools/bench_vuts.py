@@ -32,7 +32,7 @@ from measuring import append_record, benchmark_parser, spread
 from merge_sumo.controllers.kinds import load
 from merge_sumo.controllers.spec import ControllerOptions
 from merge_sumo.drivers.base import Driver, Scene
-from merge_sumo.road.merge import road_of
+from merge_sumo.road.loader import road_of
 from merge_sumo.scenario.case import Case
 from merge_sumo.scenario.scenario import DT_S, US23
 from merge_sumo.sumo.binding import SUMO_OPTIONS, sumo_program

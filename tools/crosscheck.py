@@ -32,8 +32,8 @@ from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.recorded import RecordedCampaign
 from merge_sumo.campaigns.settings import CampaignSettings, settings_of
 from merge_sumo.errors import UserError
-from merge_sumo.road.corridor import Corridor
-from merge_sumo.road.merge import centre_lines
+from merge_sumo.road.loader import centre_lines
+from merge_sumo.road.road import Road
 from merge_sumo.scenario.case import Case, FloatArray
 from merge_sumo.scenario.scenario import DT_S, VEHICLES, VUT, Scenario
 from merge_sumo.scenario.trajectory import Trajectory
@@ -60,7 +60,7 @@ class HighwayEnvWorld(KinematicSimulation):
     its vehicles.
     """
 
-    def __init__(self, corridors: int, road: Corridor, scenario: Scenario) -> None:
+    def __init__(self, corridors: int, road: Road, scenario: Scenario) -> None:
         """Make a road of HighwayEnv for each corridor."""
         super().__init__(corridors, road, scenario)
         lengths_m = [scenario.pov_length_m] * self.vehicles

@@ -18,7 +18,7 @@ from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.metrics.measures import Measures
 from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.reports.pages import X_AXIS
-from merge_sumo.road.merge import centre_lines, road_for
+from merge_sumo.road.loader import centre_lines, road_for
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.scenario.case import Case
 from merge_sumo.scenario.scenario import COLOURS, DT_S, US23, Scenario

@@ -33,7 +33,7 @@ from merge_sumo.metrics.merge import brake_after_mps2
 from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.printable import either
 from merge_sumo.records import Record
-from merge_sumo.road.merge import centre_lines
+from merge_sumo.road.loader import centre_lines
 from merge_sumo.scenario.case import Case, FloatArray
 from merge_sumo.scenario.scenario import DT_S, EpisodeTime
 from merge_sumo.scenario.trajectory import End, Trajectory

@@ -19,7 +19,7 @@ from merge_sumo.files import check_new, write_new
 from merge_sumo.printable import quoted
 from merge_sumo.result import Shown
 from merge_sumo.road.drawing import road_svg
-from merge_sumo.road.merge import road_for, road_of
+from merge_sumo.road.loader import road_for, road_of
 from merge_sumo.road.scenario_file import SUFFIX, named_scenario, shipped_scenarios, to_toml
 from merge_sumo.scenario.scenario import Scenario
 

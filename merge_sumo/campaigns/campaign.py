@@ -17,8 +17,8 @@ from merge_sumo.controllers.process import LOG
 from merge_sumo.errors import UserError, notice
 from merge_sumo.files import TakenError, check_new, check_own, files_now
 from merge_sumo.metrics.outcome import Episode, Outcome
-from merge_sumo.road.corridor import Corridor
-from merge_sumo.road.merge import centre_lines, road_for
+from merge_sumo.road.loader import centre_lines, road_for
+from merge_sumo.road.road import Road
 from merge_sumo.samplers.base import Predictor, Sampler
 from merge_sumo.samplers.controller_model import (
     ControllerModel,
@@ -223,9 +223,7 @@ def case_name(index: int) -> str:
     return f"case-{index:05d}"
 
 
-def export_case(
-    run: RecordedCampaign, index: int, folder: Path, road: Corridor | None = None
-) -> Path:
+def export_case(run: RecordedCampaign, index: int, folder: Path, road: Road | None = None) -> Path:
     """Write a case of a campaign as a replay folder.
 
     Args:

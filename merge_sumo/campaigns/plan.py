@@ -17,7 +17,7 @@ from merge_sumo.campaigns.settings import CampaignSettings, settings_of
 from merge_sumo.controllers.in_memory import AnyVut, drivers_of
 from merge_sumo.controllers.kinds import load
 from merge_sumo.errors import UserError
-from merge_sumo.road.merge import road_for
+from merge_sumo.road.loader import road_for
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.scenario.case import Case
 from merge_sumo.scenario.imperfection import Actuation, Sensing

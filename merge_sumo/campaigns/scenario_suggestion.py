@@ -11,7 +11,7 @@ import numpy as np
 
 from merge_sumo.drivers.level0 import level0_time_to
 from merge_sumo.drivers.policies import policies_of, read_manifest, scenario_of
-from merge_sumo.road.corridor import MAX_LANE_M, MIN_LANE_M, Corridor, LanePath, lane_around_m
+from merge_sumo.road.road import MAX_LANE_M, MIN_LANE_M, LanePath, Road, lane_around_m
 from merge_sumo.scenario.scenario import MAX_EPISODE_S, US23, V_VUT0_MPS, Bounds, Scenario, Units
 
 MARGIN: Final = 0.15
@@ -30,7 +30,7 @@ FOLLOW_UP_S: Final = 5.0
 """Duration of the simulation after a merge on a lane, in s."""
 
 
-def suggested_lane_m(road: Corridor) -> Bounds | None:
+def suggested_lane_m(road: Road) -> Bounds | None:
     """Return where a scenario on a road has the acceleration lane, around the expected merge.
 
     None where the road has none on which a driver chooses where to merge.
@@ -39,7 +39,7 @@ def suggested_lane_m(road: Corridor) -> Bounds | None:
     return lane_around_m(lane.length_m) if lane is not None and lane.gives_a_choice else None
 
 
-def kind_of_merge(road: Corridor) -> list[str]:
+def kind_of_merge(road: Road) -> list[str]:
     """Return which kind of merge a road is taken for, and why, in sentences."""
     if road.is_one_path:
         return []
@@ -75,7 +75,7 @@ def kind_of_merge(road: Corridor) -> list[str]:
     return lines
 
 
-def suggested(road: Corridor, name: str) -> Scenario:
+def suggested(road: Road, name: str) -> Scenario:
     """Return a scenario for a road: limits and lengths from the road, the rest as in the paper.
 
     The VUT starts as far from M as in the paper, or as the ramp allows, and before an acceleration
@@ -126,7 +126,7 @@ def limit_at(path: LanePath, x_m: float) -> float:
     return found[-1] if found else path.speed_limits_mps()[0][1]
 
 
-def about(road: Corridor) -> list[str]:
+def about(road: Road) -> list[str]:
     """Describe a road in lines."""
     lines = [f"net: {road.path.name}"]
     paths = {
@@ -164,7 +164,7 @@ def about(road: Corridor) -> list[str]:
     return lines
 
 
-def lane_warnings(scenario: Scenario, road: Corridor) -> list[str]:
+def lane_warnings(scenario: Scenario, road: Road) -> list[str]:
     """Return sentences on an acceleration lane that a scenario does not use, or only in part."""
     lane = road.acceleration_lane
     if lane is None or not lane.gives_a_choice:

@@ -17,8 +17,8 @@ from merge_sumo.metrics.bodies import WIDTH_M
 from merge_sumo.metrics.merge import merged_rows
 from merge_sumo.reports.cases_toml import new_file_in, write_cases
 from merge_sumo.reports.pages import environment
-from merge_sumo.road.corridor import Corridor
-from merge_sumo.road.merge import road_for
+from merge_sumo.road.loader import road_for
+from merge_sumo.road.road import Road
 from merge_sumo.scenario.case import coordinates
 from merge_sumo.scenario.scenario import DT_S, VEHICLES, VUT, Scenario
 from merge_sumo.scenario.trajectory import Trajectory
@@ -144,7 +144,7 @@ def _rows(run: RecordedCampaign, index: int) -> Iterator[dict[str, Any]]:
         yield row
 
 
-def write_openscenario(run: RecordedCampaign, index: int, folder: Path, road: Corridor) -> Path:
+def write_openscenario(run: RecordedCampaign, index: int, folder: Path, road: Road) -> Path:
     """Write a case as OpenDRIVE and as two OpenSCENARIO files; return the path of the first.
 
     In the first all cars follow their recorded trajectories. In the second, `...-free.xosc`, the
@@ -198,7 +198,7 @@ def write_openscenario(run: RecordedCampaign, index: int, folder: Path, road: Co
     return folder / f"{name}.xosc"
 
 
-def _places(road: Corridor, trajectory: Trajectory, row: int) -> list[tuple[float, float, float]]:
+def _places(road: Road, trajectory: Trajectory, row: int) -> list[tuple[float, float, float]]:
     """Return x, y and heading of a car at all steps, in m and rad."""
     places = []
     for x_m, merged in zip(trajectory.whole[:, row, 0], merged_rows(trajectory), strict=True):

@@ -17,7 +17,7 @@ from merge_sumo.metrics.cause import Diagnosis, FailureBox, Kind, diagnose, fail
 from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.metrics.summary import ErrorGroup, by_case, judge, summarise, undecided
 from merge_sumo.reports.facts import facts_of
-from merge_sumo.road.merge import road_for, road_of
+from merge_sumo.road.loader import road_for, road_of
 from merge_sumo.scenario.case import coordinates
 from merge_sumo.scenario.scenario import LEVELS
 

@@ -11,7 +11,7 @@ from typing import Any
 
 from lxml import etree
 
-from merge_sumo.road.corridor import Corridor
+from merge_sumo.road.road import Road
 from merge_sumo.scenario.scenario import COLOURS, Bounds, Scenario
 
 NAMESPACE = "http://www.w3.org/2000/svg"
@@ -30,7 +30,7 @@ PAPER = "#f7f6f3"
 Line = list[tuple[float, float]]
 
 
-def road_svg(road: Corridor, scenario: Scenario) -> bytes:
+def road_svg(road: Road, scenario: Scenario) -> bytes:
     """Return the picture of a road with the starts of a scenario on it."""
     low_m = min(scenario.x_pov0_m[0], scenario.x_vut0_m)
     high_m = AFTER_M if scenario.lane_m is None else scenario.lane_m[1] + AFTER_M
@@ -71,7 +71,7 @@ def road_svg(road: Corridor, scenario: Scenario) -> bytes:
     return etree.tostring(root, xml_declaration=True, encoding="UTF-8", pretty_print=True)
 
 
-def _part(road: Corridor, part_m: Bounds, *, on_ramp: bool) -> Line:
+def _part(road: Road, part_m: Bounds, *, on_ramp: bool) -> Line:
     """Return the points of a part of a path."""
     low_m, high_m = part_m
     steps = max(int((high_m - low_m) / STEP_M), 1)
@@ -88,7 +88,7 @@ def _draw(root: etree._Element, line: Line, colour: str, width_m: float = LANE_M
     etree.SubElement(root, "polyline", {"points": points, **style})
 
 
-def road_data(road: Corridor) -> dict[str, Any]:
+def road_data(road: Road) -> dict[str, Any]:
     """Return both paths as points (lane coordinate, x, y), and the lines of all lanes near M.
 
     M is the origin of the plane, and the road continues to the right: a net may lie anywhere.

@@ -22,13 +22,13 @@ from lxml import etree
 
 from merge_sumo.errors import UserError
 from merge_sumo.printable import meant
-from merge_sumo.road.corridor import (
+from merge_sumo.road.road import (
     AccelerationLane,
     Approach,
-    Corridor,
     LanePath,
     Piece,
     Point,
+    Road,
     lane_around_m,
 )
 from merge_sumo.road.xml_input import NET_TAGS, parse_xml, read_xml
@@ -121,7 +121,7 @@ def _feed(reader: Any, element: etree._Element, path: Path) -> None:
         ) from error
 
 
-def find_corridor(
+def find_road(
     road_net: RoadNet,
     mainline: Sequence[str],
     ramp: Sequence[str],
@@ -129,7 +129,7 @@ def find_corridor(
     room_after_m: float = ROOM_AFTER_M,
     edge_at_m: str | None = None,
     lane_m: Bounds | None = None,
-) -> Corridor:
+) -> Road:
     """Find the merge of two sequences of edges in a net.
 
     Both name the edge on which the paths become one, and may continue after it. Equal sequences are
@@ -145,7 +145,7 @@ def find_corridor(
             begin before it.
 
     Returns:
-        The corridor.
+        The road.
 
     Raises:
         UserError: an edge is unknown, a sequence is not connected, the paths never meet, or the
@@ -153,7 +153,7 @@ def find_corridor(
     """
     edges = tuple(mainline), tuple(ramp)
     try:
-        return _corridor(road_net, edges, edge_at_m, room_after_m, lane_m)
+        return _road(road_net, edges, edge_at_m, room_after_m, lane_m)
     except UserError as error:
         raise UserError(f"the net {road_net.path} cannot host a merge: {error}") from error
 
@@ -189,14 +189,14 @@ class _Meeting(NamedTuple):
     """Of the edge of the common lane, among the edges that follow on both paths."""
 
 
-def _corridor(
+def _road(
     road_net: RoadNet,
     edges: tuple[_Edges, _Edges],
     edge_at_m: str | None,
     room_after_m: float,
     lane_m: Bounds | None,
-) -> Corridor:
-    """Return the corridor of two sequences of edges."""
+) -> Road:
+    """Return the road of two sequences of edges."""
     net = road_net.net
     for name in chain(*edges):
         _check_edge(road_net, name)
@@ -230,7 +230,7 @@ def _corridor(
         shared = _placed(_continued(onward, room_after_m - end_m), end_m, pieces[-1])
         placed.append(LanePath((*pieces, *shared)))
     junction = _junction(ramp_link.source)
-    return Corridor(
+    return Road(
         path=road_net.path,
         sha256=road_net.sha256,
         mainline_edges=edges[MAINLINE],

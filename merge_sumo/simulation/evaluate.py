@@ -18,7 +18,7 @@ from merge_sumo.errors import UserError
 from merge_sumo.files import hashed
 from merge_sumo.metrics.measures import measures_of
 from merge_sumo.metrics.outcome import Episode, Outcome
-from merge_sumo.road.merge import centre_lines
+from merge_sumo.road.loader import centre_lines
 from merge_sumo.scenario.case import Case
 from merge_sumo.scenario.trajectory import End, Trajectory
 from merge_sumo.simulation.kinematic_simulator import CHUNK, KinematicSimulator

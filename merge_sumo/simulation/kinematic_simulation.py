@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from merge_sumo.road.corridor import Corridor
+from merge_sumo.road.road import Road
 from merge_sumo.scenario.case import FloatArray
 from merge_sumo.scenario.scenario import DT_S, Scenario
 from merge_sumo.sumo.sumo_simulation import PARKING_M
@@ -29,9 +29,7 @@ class KinematicSimulation:
         v_mps: speeds, (A, corridors).
     """
 
-    def __init__(
-        self, corridors: int, road: Corridor, scenario: Scenario, substeps: int = 1
-    ) -> None:
+    def __init__(self, corridors: int, road: Road, scenario: Scenario, substeps: int = 1) -> None:
         """Park the vehicles.
 
         Args:

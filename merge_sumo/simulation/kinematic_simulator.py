@@ -18,7 +18,7 @@ from dataclasses import replace
 import numpy as np
 
 from merge_sumo.errors import UserError
-from merge_sumo.road.merge import centre_lines
+from merge_sumo.road.loader import centre_lines
 from merge_sumo.scenario.case import Case, described
 from merge_sumo.scenario.scenario import VUT
 from merge_sumo.scenario.trajectory import Trajectory

@@ -16,7 +16,7 @@ from merge_sumo.controllers.spec import ControllerKind
 from merge_sumo.errors import UserError
 from merge_sumo.metrics.criterion import Criterion
 from merge_sumo.metrics.measures import MEASURES
-from merge_sumo.road.corridor import Corridor
+from merge_sumo.road.road import Road
 from merge_sumo.scenario.scenario import OWN, Scenario
 from merge_sumo.simulation.povs import Povs
 from merge_sumo.workers import AnyWorkers
@@ -73,7 +73,7 @@ class SimulationPlan:
     """
 
     scenario: Scenario
-    road: Corridor
+    road: Road
     vut: ControllerKind
     povs: Povs
     criterion: Criterion

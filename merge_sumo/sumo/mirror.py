@@ -14,7 +14,7 @@ import msgspec
 from lxml import etree
 
 from merge_sumo.errors import UserError
-from merge_sumo.road.corridor import Corridor, LanePath, LanePoint
+from merge_sumo.road.road import LanePath, LanePoint, Road
 from merge_sumo.road.xml_input import harmless_net, to_bytes
 from merge_sumo.scenario.scenario import DT_S, VEHICLES, VUT, Scenario, rgb
 from merge_sumo.sumo.binding import SPEED_MODE_COMMANDED, SUMO_OPTIONS, load_libsumo
@@ -44,7 +44,7 @@ class RefusedError(Exception):
     """A question or command that is answered by an error, as SUMO would; the connection stays."""
 
 
-def write_files(folder: Path, road: Corridor, scenario: Scenario) -> None:
+def write_files(folder: Path, road: Road, scenario: Scenario) -> None:
     """Write the files that a `MirrorSimulation` loads.
 
     Args:
@@ -76,7 +76,7 @@ class MirrorSimulation:
         """Take the folder of `write_files`; `load` starts SUMO."""
         self._libsumo = load_libsumo()
         self.road = msgspec.json.decode(
-            (folder / ROAD).read_bytes(), type=Corridor, dec_hook=lambda kind, text: kind(text)
+            (folder / ROAD).read_bytes(), type=Road, dec_hook=lambda kind, text: kind(text)
         )
         files = ("--net-file", str(folder / NET), "--additional-files", str(folder / TYPES))
         self._options = [*files, *OPTIONS]
@@ -277,7 +277,7 @@ def edges_of(path: LanePath) -> list[str]:
     return edges
 
 
-def _types(road: Corridor, scenario: Scenario) -> bytes:
+def _types(road: Road, scenario: Scenario) -> bytes:
     root = etree.Element("additional")
     for name in VEHICLES[: scenario.vehicles]:
         length_m = scenario.vut_length_m if name == VUT_ID else scenario.pov_length_m

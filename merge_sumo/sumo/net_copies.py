@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from itertools import groupby
 from typing import NamedTuple
 
-from merge_sumo.road.corridor import Corridor, LanePath, Piece, Point
+from merge_sumo.road.road import LanePath, Piece, Point, Road
 from merge_sumo.scenario.scenario import Bounds
 
 COPY = "@"
@@ -83,7 +83,7 @@ class _Hop(NamedTuple):
     target: _HostedLane | None = None
 
 
-def hosted_paths(road: Corridor) -> tuple[HostedPath, HostedPath]:
+def hosted_paths(road: Road) -> tuple[HostedPath, HostedPath]:
     """Return the paths of mainline and ramp."""
     main, ramp = map(_path, _hosted_lanes(road))
     return main, ramp
@@ -94,7 +94,7 @@ def _path(lanes: Sequence[_HostedLane]) -> HostedPath:
     return HostedPath(tuple(lane.id for lane in lanes), tuple(starts_m))
 
 
-def hosted_net(road: Corridor, copies: int, *, lane_goes_on: bool = False) -> bytes:
+def hosted_net(road: Road, copies: int, *, lane_goes_on: bool = False) -> bytes:
     """Return the net with `copies` copies of a road.
 
     A copy has an edge for every lane of the paths: as long as that lane, with its speed limit and
@@ -150,7 +150,7 @@ def _numbered(text: str, copy: int) -> str:
     return text.replace(COPY, f".{copy}")
 
 
-def _hosted_lanes(road: Corridor) -> tuple[list[_HostedLane], list[_HostedLane]]:
+def _hosted_lanes(road: Road) -> tuple[list[_HostedLane], list[_HostedLane]]:
     """Return the lanes of mainline and ramp; where the paths are one they are the same."""
     main = _lanes_of(road.mainline, "main", road.lane_m, number=1)
     ramp = _lanes_of(road.ramp, "main" if road.is_one_path else "ramp", road.lane_m, number=0)
@@ -220,7 +220,7 @@ def _hops(lanes: Sequence[_HostedLane], *, lane_goes_on: bool) -> Iterator[_Hop]
     yield _Hop(source)
 
 
-def _crossing(name: str, hops: Sequence[_Hop], road: Corridor) -> tuple[str, list[str]]:
+def _crossing(name: str, hops: Sequence[_Hop], road: Road) -> tuple[str, list[str]]:
     """Return a junction and its connections."""
     links: list[_Hop] = []
     targets: dict[str, _HostedLane] = {}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 
 from merge_sumo.errors import UserError
-from merge_sumo.road.corridor import Corridor
+from merge_sumo.road.road import Road
 from merge_sumo.road.xml_input import harmless_net, read_xml, to_bytes
 from merge_sumo.sumo.binding import run_program, scratch_folder
 
@@ -17,7 +17,7 @@ CONVERSION_LIMIT_S = 180.0
 """Time that netconvert has for a net; it needs 10 s for that of a city."""
 
 
-def opendrive(road: Corridor) -> bytes:
+def opendrive(road: Road) -> bytes:
     """Return the net of a road as OpenDRIVE in the same coordinates.
 
     netconvert draws its own ways over junctions, up to a metre from SUMO's.

@@ -22,9 +22,9 @@ from merge_sumo.metrics.merge import Conflict
 from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.records import convert, read_record, to_json
 from merge_sumo.result import Result
-from merge_sumo.road.corridor import Corridor
 from merge_sumo.road.finder import FARTHEST_M
-from merge_sumo.road.merge import road_of
+from merge_sumo.road.loader import road_of
+from merge_sumo.road.road import Road
 from merge_sumo.road.xml_input import RECORD_TAGS, parse_xml, read_xml
 from merge_sumo.scenario.case import FloatArray
 from merge_sumo.scenario.scenario import (
@@ -47,11 +47,11 @@ from merge_sumo.sumo.replay_folder import (
     NET,
     RECORD,
     SCENARIO,
-    Road,
+    ReplayRoad,
     case_line,
-    corridor_of_hosted,
     files_of,
     motion_record,
+    road_of_hosted,
 )
 
 REPLAYED = "replayed.fcd.xml"
@@ -194,7 +194,7 @@ class _Episode:
         record: `COLUMNS` of each vehicle at each step, (T, A, 4).
     """
 
-    road: Road
+    road: ReplayRoad
     outcome: Outcome
     trajectory: Trajectory
     record: FloatArray
@@ -220,7 +220,7 @@ def _read(folder: Path) -> _Episode:
             f"{name} must have {', '.join(VEHICLES[:cars])} every {DT_S:g} s, in {1 + HOLD_STEPS} "
             "or more rows"
         )
-    motion = _motion(record, lanes, road.corridor, name)
+    motion = _motion(record, lanes, road.road, name)
     measures = outcome.measures
     end = round(measures.t_end_s / DT_S)
     if not 0 <= end < len(motion):
@@ -242,15 +242,15 @@ def _outcome(path: Path) -> Outcome:
         raise UserError(f"{path} is not the case of a replay: {error}") from error
 
 
-def _road(path: Path, outcome: Outcome) -> Road:
+def _road(path: Path, outcome: Outcome) -> ReplayRoad:
     content = read_xml(path, "the net")
     if path.name == NET:
         shipped = road_of()
         if content != shipped.path.read_bytes():
             raise UserError(f"{path} is not the net of this version: export the case again")
-        return Road(content, shipped, NET)
-    corridor = corridor_of_hosted(content, path, outcome.case.scenario.lane_m)
-    return Road(hosted_net(corridor, 1, lane_goes_on=True), corridor, HOSTED_NET)
+        return ReplayRoad(content, shipped, NET)
+    road = road_of_hosted(content, path, outcome.case.scenario.lane_m)
+    return ReplayRoad(hosted_net(road, 1, lane_goes_on=True), road, HOSTED_NET)
 
 
 def _record(path: Path, name: str) -> tuple[FloatArray, dict[tuple[int, int], str]]:
@@ -281,7 +281,7 @@ def _record(path: Path, name: str) -> tuple[FloatArray, dict[tuple[int, int], st
 
 
 def _motion(
-    record: FloatArray, lanes: dict[tuple[int, int], str], road: Corridor, name: str
+    record: FloatArray, lanes: dict[tuple[int, int], str], road: Road, name: str
 ) -> FloatArray:
     """Return the motion of a record without the rows that hold its end, (T, A, 3).
 
@@ -311,7 +311,7 @@ def _staged(episode: _Episode, first: int) -> Iterator[tuple[Path, list[str]]]:
     SUMO begins one row earlier and inserts each vehicle where it last was outside of junctions: the
     route that it gives it begins there, and decides between lanes that lie on each other.
     """
-    record = motion_record(episode.road.corridor, episode.trajectory)
+    record = motion_record(episode.road.road, episode.trajectory)
     row = max(first - 1, 0)
     inserted = {car.get("id"): car for car in record[0]}
     for step in [*record][: row + 1]:

@@ -23,9 +23,9 @@ from merge_sumo.metrics.cause import cause
 from merge_sumo.metrics.merge import merged_rows
 from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.records import to_json
-from merge_sumo.road.corridor import Corridor, LanePath
-from merge_sumo.road.finder import find_corridor, read_net
-from merge_sumo.road.merge import MAINLINE_EDGES, RAMP_EDGES, road_of
+from merge_sumo.road.finder import find_road, read_net
+from merge_sumo.road.loader import MAINLINE_EDGES, RAMP_EDGES, road_of
+from merge_sumo.road.road import LanePath, Road
 from merge_sumo.road.xml_input import to_bytes
 from merge_sumo.scenario.case import Case, FloatArray, described
 from merge_sumo.scenario.scenario import DT_S, VEHICLES, VUT, Bounds, level_name, rgb
@@ -74,17 +74,17 @@ class Picture:
 
 
 @dataclass(frozen=True, slots=True)
-class Road:
+class ReplayRoad:
     """The road of a replay folder."""
 
     net: bytes
-    corridor: Corridor
+    road: Road
     """Found in that net, so that its lanes have the ids that they have there."""
     file: str
     """Name of the net in the folder."""
 
 
-def write_scenario(folder: Path, road: Corridor, outcome: Outcome, trajectory: Trajectory) -> Path:
+def write_scenario(folder: Path, road: Road, outcome: Outcome, trajectory: Trajectory) -> Path:
     """Write an episode as a replay folder and return the path of its configuration.
 
     Args:
@@ -99,19 +99,21 @@ def write_scenario(folder: Path, road: Corridor, outcome: Outcome, trajectory: T
     written = _road(road, folder)
     scenario = outcome.case.scenario.to_record() | {"net": None}
     case = to_json({SCENARIO: scenario, **outcome.to_record()}, indent=2)
-    record = motion_record(written.corridor, trajectory)
+    record = motion_record(written.road, trajectory)
     write_folder(folder, {CASE: case, **files_of(written, outcome, trajectory, record)})
     return folder / CONFIG
 
 
-def _road(road: Corridor, folder: Path) -> Road:
+def _road(road: Road, folder: Path) -> ReplayRoad:
     """Return a road as a folder has it."""
     edges, shipped = (road.mainline_edges, road.ramp_edges), road_of()
     if (road.sha256, *edges) == (shipped.sha256, MAINLINE_EDGES, RAMP_EDGES):
-        return Road(shipped.path.read_bytes(), shipped, NET)
+        return ReplayRoad(shipped.path.read_bytes(), shipped, NET)
     fast = replace(road, mainline=_fast(road.mainline), ramp=_fast(road.ramp))
     content = hosted_net(fast, 1, lane_goes_on=True)
-    return Road(content, corridor_of_hosted(content, folder / HOSTED_NET, fast.lane_m), HOSTED_NET)
+    return ReplayRoad(
+        content, road_of_hosted(content, folder / HOSTED_NET, fast.lane_m), HOSTED_NET
+    )
 
 
 def _fast(path: LanePath) -> LanePath:
@@ -122,8 +124,8 @@ def _fast(path: LanePath) -> LanePath:
     return LanePath(tuple(replace(piece, speed_limit_mps=200.0) for piece in path.pieces))
 
 
-def corridor_of_hosted(content: bytes, path: Path, lane_m: Bounds | None) -> Corridor:
-    """Find the corridor in the net of a folder.
+def road_of_hosted(content: bytes, path: Path, lane_m: Bounds | None) -> Road:
+    """Find the road in the net of a folder.
 
     Args:
         content: the net.
@@ -131,10 +133,10 @@ def corridor_of_hosted(content: bytes, path: Path, lane_m: Bounds | None) -> Cor
         lane_m: begin and end of the acceleration lane of its scenario.
 
     Returns:
-        The corridor.
+        The road.
 
     Raises:
-        UserError: the net has no such corridor.
+        UserError: the net has no such road.
     """
     net = read_net(path, content)
     numbered: dict[str, dict[int, str]] = {"main": {}, "ramp": {}, "out": {}}
@@ -145,7 +147,7 @@ def corridor_of_hosted(content: bytes, path: Path, lane_m: Bounds | None) -> Cor
     # Without a ramp both vehicles drive on one path.
     is_one_path = len(main) + len(out) == len(net.edges)
     lane = [] if lane_m is None else [LANE_EDGE]
-    return find_corridor(
+    return find_road(
         net,
         main + lane + out,
         (main if is_one_path else ramp) + lane + out,
@@ -156,7 +158,7 @@ def corridor_of_hosted(content: bytes, path: Path, lane_m: Bounds | None) -> Cor
 
 
 def files_of(
-    road: Road, outcome: Outcome, trajectory: Trajectory, record: etree._Element
+    road: ReplayRoad, outcome: Outcome, trajectory: Trajectory, record: etree._Element
 ) -> dict[str, bytes]:
     """Return the files that SUMO reads of an episode, the configuration last.
 
@@ -169,7 +171,7 @@ def files_of(
     Returns:
         The contents by name.
     """
-    picture = _picture(road.corridor, record)
+    picture = _picture(road.road, record)
     roots = {
         TYPES: _types(trajectory),
         LABELS: _labels(outcome, trajectory, picture),
@@ -203,7 +205,7 @@ def _types(trajectory: Trajectory) -> etree._Element:
     return root
 
 
-def motion_record(road: Corridor, trajectory: Trajectory) -> etree._Element:
+def motion_record(road: Road, trajectory: Trajectory) -> etree._Element:
     """Return the motion as SUMO's floating car data, with the last row held."""
     root = etree.Element("fcd-export")
     rows = [*zip(trajectory.whole.tolist(), merged_rows(trajectory).tolist(), strict=True)]
@@ -251,7 +253,7 @@ def _colour(vehicle: str) -> str:
     return ",".join(f"{part / 255.0:.2f}" for part in rgb(vehicle))
 
 
-def _picture(road: Corridor, record: etree._Element) -> Picture:
+def _picture(road: Road, record: etree._Element) -> Picture:
     """Return a picture of the way of the VUT; at a zoom of 100 it has the whole net."""
     net = [(x, y) for path in (road.mainline, road.ramp) for _, x, y in path.corners()]
     driven = []
@@ -270,7 +272,7 @@ def _box(points: Sequence[tuple[float, float]]) -> tuple[float, FloatArray]:
     return max(width_m, height_m / (0.8 * SHAPE)), (low + high) / 2.0
 
 
-def _config(road: Road, timesteps: int) -> etree._Element:
+def _config(road: ReplayRoad, timesteps: int) -> etree._Element:
     end_s = timesteps * DT_S
     sections = {
         "input": {"net-file": road.file, "additional-files": f"{TYPES},{LABELS}"},

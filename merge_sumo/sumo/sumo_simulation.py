@@ -31,8 +31,8 @@ from lxml import etree
 from numpy.typing import NDArray
 
 from merge_sumo.errors import UserError
-from merge_sumo.road.corridor import Corridor
-from merge_sumo.road.merge import road_of
+from merge_sumo.road.loader import road_of
+from merge_sumo.road.road import Road
 from merge_sumo.scenario.case import FloatArray
 from merge_sumo.scenario.scenario import DT_S, POV, VEHICLES, VUT, Scenario
 from merge_sumo.sumo.binding import (
@@ -79,7 +79,7 @@ class SumoSimulation:
     def __init__(
         self,
         corridors: int = 32,
-        road: Corridor | None = None,
+        road: Road | None = None,
         vut_type: Mapping[str, str] | None = None,
         *,
         scenario: Scenario,

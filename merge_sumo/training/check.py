@@ -13,7 +13,7 @@ from merge_sumo.controllers.spec import ControllerOptions
 from merge_sumo.drivers.policies import load_network
 from merge_sumo.metrics.criterion import Criterion
 from merge_sumo.metrics.paper import is_close
-from merge_sumo.road.merge import road_for
+from merge_sumo.road.loader import road_for
 from merge_sumo.scenario.case import Case, from_unit
 from merge_sumo.scenario.scenario import SVO, Scenario
 from merge_sumo.scenario.trajectory import End, Trajectory

@@ -37,7 +37,7 @@ from merge_sumo.files import cannot_write, check_own, make_folder, replace_own, 
 from merge_sumo.printable import quoted
 from merge_sumo.records import to_json, to_plain
 from merge_sumo.result import Result
-from merge_sumo.road.merge import road_for
+from merge_sumo.road.loader import road_for
 from merge_sumo.scenario.scenario import US23, Scenario
 from merge_sumo.spawning import forget_safe_path, without_cwd, without_main
 from merge_sumo.training.check import CHECK_CASES, OPPONENTS, PolicyCheck, check_policy

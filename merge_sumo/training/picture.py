@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from merge_sumo.errors import UserError
 from merge_sumo.road.drawing import road_data
-from merge_sumo.road.merge import road_for
+from merge_sumo.road.loader import road_for
 from merge_sumo.scenario.case import FloatArray
 from merge_sumo.scenario.scenario import COLOURS, Scenario
 

@@ -16,7 +16,7 @@ from merge_sumo.analysis.stress import DRAWS, RUNGS, STRESS, Flips, Rung, flips_
 from merge_sumo.metrics.measures import Measures
 from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.records import to_plain
-from merge_sumo.road.merge import road_for
+from merge_sumo.road.loader import road_for
 from merge_sumo.scenario.imperfection import Actuation
 from merge_sumo.scenario.scenario import US23
 from merge_sumo.scenario.trajectory import End

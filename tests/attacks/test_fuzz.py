@@ -22,7 +22,7 @@ from merge_sumo.drivers.policies import load_network, read_manifest
 from merge_sumo.errors import UserError
 from merge_sumo.files import resource
 from merge_sumo.reports.report import write_report
-from merge_sumo.road.merge import default_net_path, road_of
+from merge_sumo.road.loader import default_net_path, road_of
 from merge_sumo.sumo import replay
 from merge_sumo.sumo.net_copies import hosted_net
 from merge_sumo.sumo.replay_folder import CASE, RECORD

@@ -25,7 +25,7 @@ from merge_sumo.analysis.truth import ground_truth, read_truth
 from merge_sumo.campaigns.recorded import OUTCOMES, SETTINGS, TRAJECTORIES
 from merge_sumo.errors import UserError
 from merge_sumo.road import xml_input
-from merge_sumo.road.merge import default_net_path, road_of
+from merge_sumo.road.loader import default_net_path, road_of
 from merge_sumo.scenario.scenario import US23
 from merge_sumo.sumo import mirror
 from merge_sumo.sumo import replay as replay_module

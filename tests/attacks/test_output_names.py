@@ -23,7 +23,7 @@ from merge_sumo.campaigns.campaign import SCENARIOS, case_name
 from merge_sumo.campaigns.recorded import OUTCOMES, SETTINGS, TRAJECTORIES
 from merge_sumo.errors import UserError
 from merge_sumo.printable import printable, quoted
-from merge_sumo.road.merge import default_net_path
+from merge_sumo.road.loader import default_net_path
 from merge_sumo.simulation.simulator import Simulator
 from merge_sumo.training import helix
 from merge_sumo.workers import Workers

@@ -19,7 +19,7 @@ from merge_sumo.campaigns.recorded import RecordedCampaign, read_outcomes, read_
 from merge_sumo.errors import UserError
 from merge_sumo.metrics.measures import OURS, Measures
 from merge_sumo.metrics.outcome import Episode, Outcome
-from merge_sumo.road.merge import centre_lines, road_for
+from merge_sumo.road.loader import centre_lines, road_for
 from merge_sumo.scenario.case import Case
 from merge_sumo.scenario.scenario import US23
 from merge_sumo.scenario.trajectory import End, Trajectory

@@ -32,7 +32,7 @@ from merge_sumo.controllers.traci import vut
 from merge_sumo.controllers.traci.vut import TraciVut
 from merge_sumo.drivers.base import Scene
 from merge_sumo.errors import UserError
-from merge_sumo.road.merge import road_of
+from merge_sumo.road.loader import road_of
 from merge_sumo.scenario.case import Case
 from merge_sumo.scenario.scenario import DT_S, US23, VUT
 from merge_sumo.scenario.trajectory import End

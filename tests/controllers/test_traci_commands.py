@@ -170,7 +170,7 @@ class TestAVehicleModelOfItsOwn:
     LAW = "def act(seen):\n    return 2.5 * sin(0.9 * seen.t_s), True\n"
     MODEL = """
 from math import exp, sin
-from merge_sumo.road.merge import road_of
+from merge_sumo.road.loader import road_of
 
 vehicle, ramp, decay = traci.vehicle, road_of().ramp, exp(-0.1 / 0.3)
 while traci.simulation.getMinExpectedNumber() > 0:

@@ -26,7 +26,7 @@ from merge_sumo.drivers.policies import (
     read_manifest,
     scenario_of,
 )
-from merge_sumo.road.merge import road_for
+from merge_sumo.road.loader import road_for
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.scenario.case import from_unit
 from merge_sumo.scenario.scenario import US23

@@ -13,7 +13,7 @@ import pytest
 from shapely import Polygon
 from support.plans import plan_for
 
-from merge_sumo.road.corridor import Corridor
+from merge_sumo.road.road import Road
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.samplers.registry import make_sampler
 from merge_sumo.scenario.case import Pool
@@ -25,7 +25,7 @@ LENGTH_M, WIDTH_M, NEAR_M = 5.0, 1.8, 6.0
 HARSH_MPS2, CLOSE_CALL = 3.0, 1e-6
 
 
-def body(road: Corridor, front_m: float, *, on_ramp: bool) -> Polygon:
+def body(road: Road, front_m: float, *, on_ramp: bool) -> Polygon:
     """Return the rectangle of a car whose front bumper is at a lane coordinate."""
     front, rear = (road.lane_point(x, on_ramp=on_ramp) for x in (front_m, front_m - LENGTH_M))
     along = np.array([front.x_m - rear.x_m, front.y_m - rear.y_m])
@@ -36,7 +36,7 @@ def body(road: Corridor, front_m: float, *, on_ramp: bool) -> Polygon:
     return Polygon([nose + across, nose - across, tail - across, tail + across])
 
 
-def overlap_before_m(road: Corridor, trajectory: Trajectory) -> float:
+def overlap_before_m(road: Road, trajectory: Trajectory) -> float:
     """Return the largest area, in m2, that a car of the mainline and the VUT share before M."""
     largest, x_m = 0.0, trajectory.motion[:, :, 0]
     for row in range(x_m.shape[1]):

@@ -21,7 +21,7 @@ from merge_sumo.campaigns.campaign import export_case
 from merge_sumo.campaigns.recorded import failures
 from merge_sumo.errors import Notice, UserError
 from merge_sumo.reports.exports import columns_of, write_openscenario, write_table
-from merge_sumo.road.merge import road_for, road_of
+from merge_sumo.road.loader import road_for, road_of
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.scenario.scenario import DT_S
 

@@ -9,13 +9,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.foreign_nets import FOREIGN, LANE_M, LANES, lane_corridor_of, lane_drop
+from support.foreign_nets import FOREIGN, LANE_M, LANES, foreign_lane_road, lane_drop
 
 from merge_sumo import api
 from merge_sumo.errors import UserError
-from merge_sumo.road.corridor import Corridor
-from merge_sumo.road.finder import find_corridor, read_net
-from merge_sumo.road.merge import road_for
+from merge_sumo.road.finder import find_road, read_net
+from merge_sumo.road.loader import road_for
+from merge_sumo.road.road import Road
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.scenario.scenario import Scenario
 
@@ -27,9 +27,9 @@ def road(tmp_path_factory):
     """Return a function that finds the acceleration lane of a net, of which LANE_M is a part."""
     found = {"us23-lane": road_for(named_scenario("us23-lane"))}
 
-    def get(name: str) -> Corridor:
+    def get(name: str) -> Road:
         if name not in found:
-            found[name] = lane_corridor_of(name, tmp_path_factory.mktemp("net"))
+            found[name] = foreign_lane_road(name, tmp_path_factory.mktemp("net"))
         return found[name]
 
     return get
@@ -67,13 +67,13 @@ class TestTheWindow:
         net = read_net(lane_drop(tmp_path))
         said = r"is -150 to 130, 280 m, .* 215\.4 m long: write lane_m = \[-75\.4, 139\.9\]$"
         with pytest.raises(UserError, match=said):
-            find_corridor(net, ["in", "acc", "out"], ["ramp", "acc", "out"], lane_m=(-150.0, 130.0))
+            find_road(net, ["in", "acc", "out"], ["ramp", "acc", "out"], lane_m=(-150.0, 130.0))
 
     def test_is_refused_on_a_road_without_such_a_lane(self, tmp_path):
         build, mainline, ramp = FOREIGN["priority"]
         net = read_net(build(tmp_path))
         with pytest.raises(UserError, match=r"meet in one point, .* leave lane_m out"):
-            find_corridor(net, mainline.split(), ramp.split(), lane_m=LANE_M)
+            find_road(net, mainline.split(), ramp.split(), lane_m=LANE_M)
 
 
 class TestAScenario:

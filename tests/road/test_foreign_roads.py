@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from lxml import etree
-from support.foreign_nets import FOREIGN, LANES, lane_corridor_of
+from support.foreign_nets import FOREIGN, LANES, foreign_lane_road
 from support.handmade import write_run
 from support.replays import assert_identical, commanded, write_replay
 
@@ -22,7 +22,7 @@ from merge_sumo import api
 from merge_sumo.errors import UserError
 from merge_sumo.reports.exports import write_openscenario
 from merge_sumo.road.drawing import road_data
-from merge_sumo.road.merge import default_net_path, road_of
+from merge_sumo.road.loader import default_net_path, road_of
 from merge_sumo.road.xml_input import MAX_BYTES
 from merge_sumo.scenario.case import Case
 from merge_sumo.scenario.scenario import US23
@@ -37,9 +37,9 @@ STANDS_THEN_GOES = np.array([(2.0, -4.0 if step < 120 else 2.0) for step in rang
 
 @pytest.mark.parametrize("name", FOREIGN)
 def test_a_replay_of_any_motion_is_identical_also_after_the_end_of_the_net(
-    corridor, tmp_path, name
+    built_road, tmp_path, name
 ):
-    road = corridor(name)
+    road = built_road(name)
     case = Case(level=0, x_pov0_m=-300.0, v_pov0_mps=30.0, scenario=US23)
     x_m = [-min(300.0, road.mainline.before_m), -min(182.0, road.ramp.before_m)]
     for number, accelerations in enumerate((RANDOM, STANDS_THEN_GOES)):
@@ -90,9 +90,9 @@ def made(tmp_path_factory):
 class TestAnExport:
     @pytest.mark.parametrize("name", FOREIGN)
     def test_to_openscenario_lies_on_the_lanes_of_its_opendrive(
-        self, made, corridor, tmp_path, name
+        self, made, built_road, tmp_path, name
     ):
-        road = corridor(name)
+        road = built_road(name)
         tree = etree.parse(write_openscenario(made, 0, tmp_path / "case", road))
         road_file = tree.find(".//RoadNetwork/LogicFile").get("filepath")
         segments = lane_centres(tmp_path / "case" / road_file)
@@ -113,7 +113,7 @@ class TestAnExport:
 
     @pytest.mark.parametrize("name", LANES)
     def test_to_opendrive_has_both_lanes_of_a_merge(self, tmp_path, name):
-        road = lane_corridor_of(name, tmp_path)
+        road = foreign_lane_road(name, tmp_path)
         begin_m, end_m = road.lane_m
         (tmp_path / "road.xodr").write_bytes(opendrive(road))
         segments = lane_centres(tmp_path / "road.xodr")
@@ -128,9 +128,9 @@ class TestAnExport:
 
 @pytest.mark.parametrize("name", ["curved", "zipper", "OSM"])
 def test_the_report_draws_cars_where_they_are_with_m_as_origin_and_the_road_to_the_right(
-    corridor, name
+    built_road, name
 ):
-    road = corridor(name)
+    road = built_road(name)
     drawn = road_data(road)
     m = road.lane_point(0.0, on_ramp=False)
     turn = np.exp(-1j * math.radians(90.0 - m.angle_deg))

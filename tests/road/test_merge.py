@@ -8,14 +8,14 @@ from pathlib import Path
 
 import pytest
 
-from merge_sumo.road.corridor import Corridor
-from merge_sumo.road.merge import default_net_path, road_of
+from merge_sumo.road.loader import default_net_path, road_of
+from merge_sumo.road.road import Road
 
 ROOT = Path(__file__).resolve().parents[2]
 
 
 @pytest.fixture(scope="module")
-def road() -> Corridor:
+def road() -> Road:
     return road_of()
 
 

@@ -15,7 +15,7 @@ from merge_sumo.drivers.policies import HUMAN, policies_in, policies_of
 from merge_sumo.metrics.criterion import Criterion
 from merge_sumo.metrics.outcome import Outcome, Prediction
 from merge_sumo.records import decode, to_plain
-from merge_sumo.road.merge import centre_lines, road_for
+from merge_sumo.road.loader import centre_lines, road_for
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.samplers.controller_model import FAR, ControllerModel, ModelRollout, Observation
 from merge_sumo.samplers.coverage import CoverageSampler

@@ -14,7 +14,7 @@ from merge_sumo.campaigns.recorded import RecordedCampaign
 from merge_sumo.campaigns.scenario_suggestion import suggested, unseen
 from merge_sumo.errors import UserError
 from merge_sumo.metrics.measures import Measures
-from merge_sumo.road.merge import road_for
+from merge_sumo.road.loader import road_for
 from merge_sumo.road.scenario_file import named_scenario, read_scenario, to_toml
 from merge_sumo.scenario.case import Case, Pool, to_unit
 from merge_sumo.scenario.scenario import RANGES, US23, Scenario

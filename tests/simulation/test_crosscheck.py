@@ -11,7 +11,7 @@ from crosscheck import HighwayEnvWorld, crosscheck
 from support.campaigning import run_campaign
 
 from merge_sumo.campaigns.settings import CampaignSettings
-from merge_sumo.road.merge import road_for
+from merge_sumo.road.loader import road_for
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.scenario.scenario import LEVELS, US23, VUT
 

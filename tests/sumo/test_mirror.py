@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import replace
 
 import pytest
-from support.foreign_nets import LANE_M, LANES, lane_corridor_of
+from support.foreign_nets import LANE_M, LANES, foreign_lane_road
 from support.traci_pair import ToSession, close_mirror, mirror
 
 from merge_sumo.controllers.traci.session import Session
-from merge_sumo.road.merge import road_for
+from merge_sumo.road.loader import road_for
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.scenario.scenario import DT_S, US23, VEHICLES
 
@@ -65,7 +65,7 @@ def test_a_vehicle_beyond_the_end_of_the_net_arrives_and_the_others_are_answered
 
 @pytest.mark.parametrize("name", LANES)
 def test_a_lane_change_anywhere_on_an_acceleration_lane_is_a_merge_request(name, tmp_path):
-    road = lane_corridor_of(name, tmp_path)
+    road = foreign_lane_road(name, tmp_path)
     session = Session(mirror(tmp_path, replace(US23, lane_m=LANE_M), road))
     vehicle, v_mps = ToSession(session).vehicle, 15.0
     begin_m, end_m = road.lane_m or (0.0, 0.0)

@@ -16,13 +16,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from lxml import etree
-from support.foreign_nets import LANE_M, lane_corridor_of
+from support.foreign_nets import LANE_M, foreign_lane_road
 from support.replays import assert_identical, commanded, write_replay
 
 from merge_sumo.campaigns.campaign import export_case
 from merge_sumo.campaigns.recorded import failures
 from merge_sumo.errors import UserError
-from merge_sumo.road.merge import road_for, road_of
+from merge_sumo.road.loader import road_for, road_of
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.scenario.case import Case
 from merge_sumo.scenario.scenario import DT_S, US23
@@ -117,7 +117,7 @@ def test_a_merge_from_a_lane_is_seen_in_the_row_in_which_it_happens(tmp_path, na
         scenario = named_scenario(name)
         road = road_for(scenario)
     else:
-        scenario, road = replace(US23, lane_m=LANE_M), lane_corridor_of(name, tmp_path)
+        scenario, road = replace(US23, lane_m=LANE_M), foreign_lane_road(name, tmp_path)
     begin_m, end_m = road.lane_m
     place_m = {"gore": max(begin_m, -198.0), "lane": 21.0, "end": end_m}[place]
     steps = int(np.ceil((place_m + 201.0) / 2.0))

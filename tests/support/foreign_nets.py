@@ -6,8 +6,8 @@ import math
 import subprocess
 from pathlib import Path
 
-from merge_sumo.road.corridor import Corridor
-from merge_sumo.road.finder import find_corridor, read_net
+from merge_sumo.road.finder import find_road, read_net
+from merge_sumo.road.road import Road
 from merge_sumo.scenario.scenario import Bounds
 from merge_sumo.sumo.binding import sumo_program
 
@@ -167,13 +167,13 @@ LANE_M = (-30.0, 60.0)
 """Of a scenario; the lanes of these nets are longer."""
 
 
-def corridor_of(name: str, folder: Path, lane_m: Bounds | None = None) -> Corridor:
+def foreign_road(name: str, folder: Path, lane_m: Bounds | None = None) -> Road:
     """Build a net and find its merge."""
     build, mainline, ramp = (LANES if lane_m else FOREIGN)[name]
     net = read_net(build(folder))
-    return find_corridor(net, mainline.split(), ramp.split(), lane_m=lane_m)
+    return find_road(net, mainline.split(), ramp.split(), lane_m=lane_m)
 
 
-def lane_corridor_of(name: str, folder: Path) -> Corridor:
+def foreign_lane_road(name: str, folder: Path) -> Road:
     """Return the merge in one of `LANES`, with its acceleration lane."""
-    return corridor_of(name, folder, LANE_M)
+    return foreign_road(name, folder, LANE_M)

@@ -7,7 +7,7 @@ from merge_sumo.controllers.kinds import load
 from merge_sumo.controllers.spec import ControllerKind, ControllerOptions
 from merge_sumo.drivers.policies import policies_of
 from merge_sumo.metrics.criterion import Criterion
-from merge_sumo.road.merge import road_for
+from merge_sumo.road.loader import road_for
 from merge_sumo.scenario.scenario import US23, Scenario
 from merge_sumo.simulation.plan import MAX_CORRIDORS, SimulationPlan
 from merge_sumo.simulation.povs import Povs

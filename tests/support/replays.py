@@ -8,7 +8,7 @@ import numpy as np
 
 from merge_sumo.metrics.measures import Measures
 from merge_sumo.metrics.outcome import Outcome
-from merge_sumo.road.corridor import Corridor
+from merge_sumo.road.road import Road
 from merge_sumo.scenario.case import Case
 from merge_sumo.scenario.scenario import DT_S
 from merge_sumo.scenario.trajectory import End, Trajectory
@@ -31,7 +31,7 @@ def commanded(
     return Trajectory(case, np.array(rows), end)
 
 
-def write_replay(folder: Path, road: Corridor, trajectory: Trajectory) -> Path:
+def write_replay(folder: Path, road: Road, trajectory: Trajectory) -> Path:
     outcome = Outcome(0, 0, trajectory.case, Measures.of(trajectory))
     write_scenario(folder, road, outcome, trajectory)
     return folder

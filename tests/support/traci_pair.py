@@ -20,8 +20,8 @@ from traci.storage import Storage
 
 from merge_sumo.controllers.traci import protocol as tp
 from merge_sumo.controllers.traci.session import Session
-from merge_sumo.road.corridor import Corridor
-from merge_sumo.road.merge import road_of
+from merge_sumo.road.loader import road_of
+from merge_sumo.road.road import Road
 from merge_sumo.scenario.scenario import DT_S, US23, Scenario
 from merge_sumo.sumo.binding import sumo_environment, sumo_program
 from merge_sumo.sumo.mirror import (
@@ -149,9 +149,7 @@ _mirrors: list[MirrorSimulation] = []
 """libsumo holds one simulation per process."""
 
 
-def mirror(
-    folder: Path, scenario: Scenario = US23, road: Corridor | None = None
-) -> MirrorSimulation:
+def mirror(folder: Path, scenario: Scenario = US23, road: Road | None = None) -> MirrorSimulation:
     """Return the mirror simulation of this process, with an empty road at time 0."""
     road = road or road_of()
     write_files(folder, road, scenario)

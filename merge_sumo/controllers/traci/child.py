@@ -34,7 +34,7 @@ from merge_sumo.controllers.traci.protocol import (
 from merge_sumo.controllers.traci.session import NotFiniteError, Session
 from merge_sumo.errors import UserError
 from merge_sumo.files import ScratchFolder
-from merge_sumo.road.corridor import Corridor
+from merge_sumo.road.road import Road
 from merge_sumo.scenario.scenario import Scenario
 from merge_sumo.sumo.binding import sumo_environment
 from merge_sumo.sumo.mirror import VUT_ID, MirrorSimulation, State, write_files
@@ -81,7 +81,7 @@ class FaultError(Exception):
 class Child(ChildProcess):
     """The serving process, with the road and the vehicles of a scenario."""
 
-    def __init__(self, road: Corridor, scenario: Scenario) -> None:
+    def __init__(self, road: Road, scenario: Scenario) -> None:
         """Start the process; `UserError` if it cannot be started."""
         if os.name != "posix":
             raise UserError("a controller by TraCI needs Linux or macOS")

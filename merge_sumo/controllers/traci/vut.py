@@ -34,7 +34,7 @@ from merge_sumo.drivers.base import MERGE, STAY, ControllerDiedError, Driver, Sc
 from merge_sumo.drivers.lane import END_MARGIN_M, stopping_mps
 from merge_sumo.errors import UserError
 from merge_sumo.files import check_code
-from merge_sumo.road.corridor import Corridor
+from merge_sumo.road.road import Road
 from merge_sumo.scenario.case import Case, FloatArray
 from merge_sumo.scenario.scenario import DT_S, VEHICLES, VUT, Scenario
 from merge_sumo.sumo.sumo_simulation import SumoSimulation
@@ -108,7 +108,7 @@ class TraciVut(Driver):
 
     def __init__(
         self,
-        road: Corridor,
+        road: Road,
         scenario: Scenario,
         port: int,
         command: list[str] | None,

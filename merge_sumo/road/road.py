@@ -195,7 +195,7 @@ def lane_around_m(length_m: float) -> Bounds:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Corridor:
+class Road:
     """A merge in a net: the road for the simulation, replays and exports.
 
     Example:

@@ -12,17 +12,17 @@ import pytest
 from support.foreign_nets import FOREIGN, edge, lane, node, plain, straight
 
 from merge_sumo.errors import UserError
-from merge_sumo.road.corridor import LanePath, Piece
-from merge_sumo.road.finder import RoadNet, find_corridor, read_net
-from merge_sumo.road.merge import road_for
+from merge_sumo.road.finder import RoadNet, find_road, read_net
+from merge_sumo.road.loader import road_for
+from merge_sumo.road.road import LanePath, Piece
 from merge_sumo.scenario.scenario import US23
 from merge_sumo.sumo.binding import load_libsumo
 from merge_sumo.sumo.sumo_simulation import SumoSimulation
 
 
 @pytest.mark.parametrize("name", FOREIGN)
-def test_a_point_of_a_path_is_where_sumo_draws_its_lane(corridor, name):
-    road = corridor(name)
+def test_a_point_of_a_path_is_where_sumo_draws_its_lane(built_road, name):
+    road = built_road(name)
     libsumo = load_libsumo()
     libsumo.start(["sumo", "-n", str(road.path), "--no-step-log", "--no-warnings"])
     compared = 0
@@ -71,8 +71,8 @@ def test_the_nearest_place_of_a_path_by_hand():
         ("OSM", True, ("M", False), ("m", True)),
     ],
 )
-def test_the_junction_at_m_says_who_goes_first(corridor, name, lane_drop_found, mainline, ramp):
-    road = corridor(name)
+def test_the_junction_at_m_says_who_goes_first(built_road, name, lane_drop_found, mainline, ramp):
+    road = built_road(name)
     assert road.lane_drop is lane_drop_found
     approaches = (road.mainline_approach, road.ramp_approach)
     assert [(a.state, a.yields) for a in approaches] == [mainline, ramp]
@@ -86,15 +86,15 @@ def test_lanes_that_cars_may_not_use_are_left_out(tmp_path):
         + edge("out", "m", "b", 1, 30, priority=9, sidewalkWidth=2, bikeLaneWidth=1)
         + edge("r", "r", "m", 1, 20, priority=3),
     )
-    road = find_corridor(read_net(net), ["in", "out"], ["r", "out"])
+    road = find_road(read_net(net), ["in", "out"], ["r", "out"])
     assert [piece.lane for piece in road.mainline.pieces] == ["in_2", ":m_2_1", "out_2"]
 
 
-def test_a_start_before_the_path_is_refused(corridor):
+def test_a_start_before_the_path_is_refused(built_road):
     with pytest.raises(UserError, match=r"ramp main_out begins 425.0 m before .* further upstream"):
         road_for(replace(US23, x_vut0_m=-600.0))
     with (
-        SumoSimulation(1, corridor("priority"), scenario=US23) as simulation,
+        SumoSimulation(1, built_road("priority"), scenario=US23) as simulation,
         pytest.raises(UserError, match=r"begins 505\.94 m before"),
     ):
         simulation.place(0, [(-340.0, 30.0), (-600.0, 12.0)])
@@ -118,7 +118,7 @@ def straight_net(tmp_path_factory) -> RoadNet:
 )
 def test_edges_without_a_merge_are_refused_in_one_sentence(straight_net, mainline, ramp, message):
     with pytest.raises(UserError, match=message) as error:
-        find_corridor(straight_net, mainline.split(), ramp.split())
+        find_road(straight_net, mainline.split(), ramp.split())
     assert "\n" not in str(error.value)
     assert str(straight_net.path) in str(error.value)
 
@@ -135,8 +135,8 @@ def test_an_acceleration_lane_over_two_edges_with_an_exit(tmp_path):
         + lane("mid", 0, "exit", 0) + lane("mid", 1, "out", 0) + lane("mid", 2, "out", 1),
     )  # fmt: skip
     with pytest.raises(UserError, match="no lane in common up to the end of edge mid"):
-        find_corridor(read_net(net), ["in", "acc", "mid"], ["ramp", "acc", "mid"])
-    road = find_corridor(read_net(net), ["in", "acc", "mid", "out"], ["ramp", "acc", "mid", "out"])
+        find_road(read_net(net), ["in", "acc", "mid"], ["ramp", "acc", "mid"])
+    road = find_road(read_net(net), ["in", "acc", "mid", "out"], ["ramp", "acc", "mid", "out"])
     assert road.acceleration_lane.lanes == ("acc_0", "mid_0")
     assert road.acceleration_lane.exits == ("exit",)
 
@@ -174,5 +174,5 @@ def test_a_broken_net_is_refused_in_one_sentence(straight_net, tmp_path, edit, m
     path = tmp_path / "broken.net.xml"
     path.write_text(edit(straight_net.path.read_text()))
     with pytest.raises(UserError, match=message) as error:
-        find_corridor(read_net(path), ["in", "out"], ["r1", "out"])
+        find_road(read_net(path), ["in", "out"], ["r1", "out"])
     assert "\n" not in str(error.value)

@@ -11,8 +11,8 @@ import numpy as np
 from merge_sumo.errors import UserError
 from merge_sumo.files import resource
 from merge_sumo.metrics.bodies import CentreLines
-from merge_sumo.road.corridor import Corridor
-from merge_sumo.road.finder import find_corridor, read_net
+from merge_sumo.road.finder import find_road, read_net
+from merge_sumo.road.road import Road
 from merge_sumo.road.xml_input import read_xml
 from merge_sumo.scenario.scenario import ROOM_AFTER_M, Bounds, Scenario
 
@@ -20,7 +20,7 @@ MAINLINE_EDGES = ("main_in", "main_out")
 RAMP_EDGES = ("ramp", "main_out")
 """Of the shipped net."""
 
-_found: dict[tuple[object, ...], Corridor] = {}
+_found: dict[tuple[object, ...], Road] = {}
 
 
 def default_net_path() -> Path:
@@ -34,7 +34,7 @@ def road_of(
     ramp: Sequence[str] = RAMP_EDGES,
     room_after_m: float = ROOM_AFTER_M,
     lane_m: Bounds | None = None,
-) -> Corridor:
+) -> Road:
     """Return the merge of two sequences of edges in a net file, by default the shipped one.
 
     A road that was found is kept until the file changes.
@@ -58,11 +58,11 @@ def road_of(
     key = (path, hashlib.sha256(content).hexdigest(), *edges, room_after_m, lane_m)
     if key not in _found:
         net_file = read_net(path, content)
-        _found[key] = find_corridor(net_file, *edges, room_after_m=room_after_m, lane_m=lane_m)
+        _found[key] = find_road(net_file, *edges, room_after_m=room_after_m, lane_m=lane_m)
     return _found[key]
 
 
-def road_for(scenario: Scenario) -> Corridor:
+def road_for(scenario: Scenario) -> Road:
     """Return the road of a scenario.
 
     Raises:
@@ -88,7 +88,7 @@ def road_for(scenario: Scenario) -> Corridor:
 _centre_lines: dict[tuple[object, ...], CentreLines] = {}
 
 
-def centre_lines(road: Corridor) -> CentreLines:
+def centre_lines(road: Road) -> CentreLines:
     """Return the centre lines of both paths of a road; they are found once in a process."""
     key = road.sha256, road.mainline_edges, road.ramp_edges, road.lane_m
     if key not in _centre_lines:
