@@ -199,22 +199,22 @@ class PovLibrary(Driver):
             else:
                 self._drivers[OWN] = PovAdapter(driver)
         self._level = np.zeros(corridors, dtype=np.int64)
-        self._levels_playing = {0}
+        self._plays = {0: np.ones(corridors, dtype=bool)}
+        """Which corridors have a POV of a level."""
 
     def begin(self, corridor: int, case: Case) -> None:
         """Take the level of a case; KeyError when it has no policy."""
         self._drivers[case.level].begin(corridor, case)
-        self._level[corridor] = case.level
-        self._levels_playing.add(case.level)
+        if self._level[corridor] != case.level:
+            self._level[corridor] = case.level
+            self._plays = {level: self._level == level for level in np.unique(self._level).tolist()}
 
     def act(self, scene: Scene) -> FloatArray:
         """Return the answer of the driver of each corridor, (K,)."""
         acceleration = np.zeros(self.corridors)
-        for level in self._levels_playing:
-            mine = scene.active & (self._level == level)
-            if mine.any():
-                of_level = scene._replace(active=mine)
-                acceleration[mine] = self._drivers[level].act(of_level)[mine]
+        for level, plays in self._plays.items():
+            of_level = scene._replace(active=scene.active & plays)
+            np.copyto(acceleration, self._drivers[level].act(of_level), where=plays)
         return acceleration
 
     def reason(self, corridor: int) -> str | None:

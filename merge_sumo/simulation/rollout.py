@@ -7,6 +7,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 
 from merge_sumo.drivers.actuation import ROUNDING_MPS2
 from merge_sumo.drivers.base import ControllerDiedError, Driver, PovDiedError, Scene
@@ -116,7 +117,9 @@ class Rollout:
         self.raised: str | None = None
         """Error that the VUT raised instead of its last answer."""
         self.timeout_at = np.full(corridors, NEVER)
-        """Rows of the record at which episodes time out."""
+        """Rows of the record at which episodes, and after M their follow-ups, end."""
+        self.follows_up = np.zeros(corridors, dtype=bool)
+        """Whether an episode continues after M."""
         # One row per step of the simulation: x, v, a of every vehicle.
         self.follow_steps = round(simulation.scenario.follow_up_s / DT_S)
         has_lane = simulation.scenario.lane_m is not None
@@ -154,34 +157,47 @@ class Rollout:
                 self.refill(everywhere)
                 continue
             self.step += 1
-            arrived = self.active & (
-                simulation.scenario.has_ended(simulation.x_m) if merged is None else merged
-            )
-            ended = arrived | (self.row >= self.timeout_at)
-            ended[list(self.errors)] = True
-            free = []
-            for corridor in np.flatnonzero(ended).tolist():
-                if corridor in self.errors:
-                    self.finish(corridor, *self.errors.pop(corridor))
-                elif not arrived[corridor]:
-                    self.finish(corridor, End.TIMEOUT)
-                elif self.follow_steps and self.follows_up(corridor):
-                    continue
-                else:
-                    self.finish(corridor, End.MERGED)
-                free.append(corridor)
-            self.refill(free)
+            self.end_episodes(merged)
         return [self.ended[index] for index in sorted(self.ended)]
 
-    def follows_up(self, corridor: int) -> bool:
-        """Return whether an episode continues after M; note where that begins."""
-        episode, x_m = self.episodes[corridor], self.simulation.x_m[:, corridor]
+    def end_episodes(self, merged: NDArray[np.bool_] | None) -> None:
+        """End the episodes that end with this step, and begin others in their corridors.
+
+        Args:
+            merged: where the road has an acceleration lane, which VUTs are on the mainline, (K,).
+        """
+        simulation = self.simulation
+        arrived = simulation.scenario.has_ended(simulation.x_m) if merged is None else merged
+        arrived = arrived & self.active & ~self.follows_up
+        for corridor in self.errors:
+            arrived[corridor] = False
+        if self.follow_steps:
+            for corridor in np.flatnonzero(arrived).tolist():
+                self.begin_follow_up(corridor)
+            end_m = simulation.road.mainline.after_m - END_OF_ROAD_M
+            ended = self.follows_up & (simulation.x_m.max(axis=0) >= end_m)
+        else:
+            ended = arrived
+        ended |= self.row >= self.timeout_at
+        for corridor in self.errors:
+            ended[corridor] = True
+        free = np.flatnonzero(ended).tolist()
+        for corridor in free:
+            if corridor in self.errors:
+                self.finish(corridor, *self.errors.pop(corridor))
+            elif arrived[corridor] or self.follows_up[corridor]:
+                self.finish(corridor, End.MERGED)
+            else:
+                self.finish(corridor, End.TIMEOUT)
+        self.refill(free)
+
+    def begin_follow_up(self, corridor: int) -> None:
+        """Note that the VUT of a corridor is at M; its episode continues."""
+        episode = self.episodes[corridor]
         assert episode is not None, "only running episodes continue"  # noqa: S101
-        if episode.merge_row is None:
-            episode.merge_row, episode.clipped = self.row, int(self.clipped[corridor])
-            self.timeout_at[corridor] = self.row + self.follow_steps
-        end_m = self.simulation.road.mainline.after_m - END_OF_ROAD_M
-        return bool(self.row < self.timeout_at[corridor] and x_m.max() < end_m)
+        episode.merge_row, episode.clipped = self.row, int(self.clipped[corridor])
+        self.timeout_at[corridor] = self.row + self.follow_steps
+        self.follows_up[corridor] = True
 
     def begin_again(self, lost: ControllerDiedError) -> None:
         """Let the running episodes begin again, one by one; end the one at fault, if any."""
@@ -231,6 +247,7 @@ class Rollout:
             case: the case; None to leave the corridor empty.
         """
         self.active[corridor] = case is not None
+        self.follows_up[corridor] = False
         self.step[corridor] = self.clipped[corridor] = 0
         if self.merging is not None:
             self.merging.begin(corridor)
@@ -253,8 +270,6 @@ class Rollout:
     def ask_drivers(self) -> FloatArray:
         """Return the accelerations of all vehicles, (A, K), within limits; write the record."""
         x_m, v_mps, scenario = self.simulation.x_m, self.simulation.v_mps, self.simulation.scenario
-        if not (np.isfinite(x_m).all() and np.isfinite(v_mps).all()):
-            raise SimulationError("a position or a speed is not finite")
         merged = x_m[VUT] >= 0.0 if self.follow_steps else None
         if self.merging is not None:
             merged = self.merging.merged
@@ -279,8 +294,8 @@ class Rollout:
             keep_safe(answer, x_m, v_mps, scenario)
         if self.merging is not None:
             self.merging.take(self.vut.merge_requests(), answer, x_m, v_mps)
-        acceleration: FloatArray = np.clip(answer, scenario.a_min_mps2, scenario.a_max_mps2)
-        acceleration[:, ~self.active] = 0.0
+        acceleration: FloatArray = answer.clip(scenario.a_min_mps2, scenario.a_max_mps2)
+        acceleration *= self.active
         self.now[..., 2] = acceleration.T
         clipped = self.vut.clipped()
         if clipped is None:
@@ -337,7 +352,7 @@ class Rollout:
             motion[-1, :, 1] = self.simulation.v_mps[:, corridor]
         motion[-1, :, 2] = 0.0
         # A vehicle that comes to a stand brakes only as hard as that takes.
-        motion[:, :, 2] = np.maximum(motion[:, :, 2], motion[:, :, 1] / -DT_S)
+        np.maximum(motion[..., 2], motion[..., 1] / -DT_S, out=motion[..., 2])
         left = series(episode.left, len(motion)), tuple(sorted(self.vut.in_vain(corridor)))
         if episode.merge_row is None or (error is not None and self.merging is not None):
             after, clipped = None, int(self.clipped[corridor])

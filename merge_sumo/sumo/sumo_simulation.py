@@ -316,13 +316,16 @@ class SumoSimulation:
     def _read_x_m(self, expected_m: FloatArray) -> FloatArray:
         """Read positions from SUMO, (A, corridors), and check that they are as expected."""
         position_m = self._of_all(self._get_position)
-        off_m = np.abs(position_m + self._start_m - expected_m)
-        for index in np.flatnonzero(~(off_m <= EXACT_M)).tolist():  # it may be on another lane
+        x_m = position_m + self._start_m
+        exact = np.abs(x_m - expected_m) <= EXACT_M
+        if exact.all():
+            return x_m
+        for index in np.flatnonzero(~exact).tolist():  # it may be on another lane
             self._start_m.flat[index] = self._lane_begins_m(self._ids[index])
         x_m = position_m + self._start_m
-        off = np.abs(x_m - expected_m).max()
-        if not off <= EXACT_M:
-            raise SimulationError(f"SUMO moved a vehicle {off} m away from where it drives")
+        off_m = np.abs(x_m - expected_m).max()
+        if not off_m <= EXACT_M:
+            raise SimulationError(f"SUMO moved a vehicle {off_m} m away from where it drives")
         return x_m
 
     def _lane_begins_m(self, name: str) -> float:
