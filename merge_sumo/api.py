@@ -592,9 +592,9 @@ def run_and_report(
             result = CampaignRun(done, config.gates)
             study = run_study.RunStudy(done, settings, replace(plan, against=None), available)
             on_part = partial(_count, bars, check)
-            counterfactuals.note_avoidance(study, partial(on_part, "careful drivers", "failures"))
-            share.note_shares(study, partial(on_part, "uniform starts", "cases"))
-            explanation.note_explanation(study)
+            counterfactuals.write_avoidance(study, partial(on_part, "careful drivers", "failures"))
+            share.write_shares(study, partial(on_part, "uniform starts", "cases"))
+            explanation.write_worst_explanation(study)
             link_latest(folder)
             write_report(done)
     except (KeyboardInterrupt, Stopped, WorkersLostError) as stop:

@@ -140,8 +140,8 @@ class CampaignRun(Result):
     @property
     def regressions(self) -> Table:
         """The cases that broke, the worst first: they pass with the earlier version alone."""
-        cases = [] if self.against is None else self.against.steps[0].cases
-        broke = [case.b.index for case in cases if case.change is Change.BROKE]
+        cases = [] if self.against is None else self.against.version_changes[0].cases
+        broke = [case.later.index for case in cases if case.change is Change.BROKE]
         return Table(self.recorded.outcome(index) for index in broke)
 
     @cached_property
@@ -200,7 +200,11 @@ class CampaignRun(Result):
             "stopped": "converged" if self.converged else "cases",
             "fail_when": criterion.as_written,
             "notes": [*filter(None, [at_limits]), *self._doubts],
-            **({} if self.against is None else {AGAINST: self.against.steps[0].to_record()}),
+            **(
+                {}
+                if self.against is None
+                else {AGAINST: self.against.version_changes[0].to_record()}
+            ),
             "repeats": to_plain(self.repeats),
             "run": str(self.folder),
             "report": str(self.report_file),
@@ -235,7 +239,7 @@ class CampaignRun(Result):
         earlier = printable(str(self.recorded.settings.against)[:NAME_CHARACTERS])
         return [
             f"against {earlier}: {comparison_headline(self.against)}",
-            *transitions(self.against.steps[0]),
+            *transitions(self.against.version_changes[0]),
             f"both motions in one picture: {self.folder / AGAINST_PAGE}",
         ]
 

@@ -15,7 +15,7 @@ import statistics
 import tempfile
 from pathlib import Path
 
-from merge_sumo.analysis.counterfactuals import CAREFUL, TAKES_OVER, avoidance
+from merge_sumo.analysis.counterfactuals import TAKES_OVER, write_avoidance
 from merge_sumo.analysis.run_study import RunStudy
 from merge_sumo.campaigns.campaign import run_campaign
 from merge_sumo.campaigns.plan import resolve
@@ -41,7 +41,7 @@ HEAD = (
 def row(vut: str, cases: int, workers: int | None) -> str:
     """Run uniform cases at each level and return the line of the table."""
     failures, timeouts, coverage, known, times = [], 0, [], 0, []
-    avoided = dict.fromkeys((CAREFUL, TAKES_OVER), 0)
+    avoided = dict.fromkeys(("careful", TAKES_OVER), 0)
     with tempfile.TemporaryDirectory() as folder:
         for level in LEVELS:
             settings = CampaignSettings(
@@ -55,7 +55,7 @@ def row(vut: str, cases: int, workers: int | None) -> str:
             plan = resolve(settings)
             with open_workers(plan.workers(workers)) as there:
                 run = run_campaign(settings, plan, Path(folder) / str(level), workers=there)
-                failing = avoidance(RunStudy(run, settings, plan, there))
+                failing = write_avoidance(RunStudy(run, settings, plan, there))
             found = summarise(run.outcomes, (level,)).levels[level]
             failures.append(found.failures)
             coverage.append(f"{found.fmc:.4f}")

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 from msgspec import Meta
 
-from merge_sumo.analysis.comparison import Change, ComparedCase, passes, short
+from merge_sumo.analysis.comparison import Change, ComparedCase
 from merge_sumo.campaigns.recorded import RecordedCampaign
 from merge_sumo.errors import UserError
 from merge_sumo.metrics.criterion import PAPER_CRITERION, Criterion
@@ -118,15 +118,24 @@ class CasesFile(RecordedCampaign):
 
         It accepts neither a new error nor a new contact.
         """
-        a, b = one.a.measures, one.b.measures
-        if b.error is not None and a.error is None:
+        earlier, later = one.earlier.measures, one.later.measures
+        if later.error is not None and earlier.error is None:
             return Change.BROKE
-        if passes(one.a) and passes(one.b):
-            less = short(one.a.margin) - short(one.b.margin) > self.tolerance
-            touches = b.severity == Severity.CONTACT != a.severity
+        if one.earlier.passes and one.later.passes:
+            less = short(one.earlier.margin) - short(one.later.margin) > self.tolerance
+            touches = later.severity == Severity.CONTACT != earlier.severity
             return Change.WORSE if less or touches else Change.BOTH
-        is_accepted = one.a.index in self.accepted and not b.end.is_error
-        return Change.ACCEPTED if is_accepted and not passes(one.b) else one.change
+        is_accepted = one.earlier.index in self.accepted and not later.end.is_error
+        return Change.ACCEPTED if is_accepted and not one.later.passes else one.change
+
+
+def short(value: Any) -> Any:
+    """Return a number to the digits of a cases file, another value as it is.
+
+    Args:
+        value: a number, or a value of another type.
+    """
+    return float(f"{value:.6g}") if isinstance(value, float) else value
 
 
 def verdict_of(outcome: Outcome) -> str:

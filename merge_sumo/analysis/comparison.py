@@ -54,10 +54,10 @@ class Version:
     Attributes:
         vut: name of the VUT.
         folder: folder of its campaign; None where it ran the cases of another version's campaign.
-        outcomes: all runs.
-        tolerated: share of its runs in which a case may fail.
-        motions: returns its motions.
-        sampler: the sampler that chose its cases.
+        outcomes: its outcomes, one for each run of a case.
+        tolerated: share of its runs in which a case may fail, 0 to 1.
+        motions: returns its motions by the indices of cases.
+        sampler: name of the sampler that chose its cases.
     """
 
     vut: str
@@ -69,7 +69,11 @@ class Version:
 
     @classmethod
     def of(cls, run: RecordedCampaign) -> Version:
-        """Return a campaign as a version."""
+        """Return the version of a recorded campaign.
+
+        Args:
+            run: the campaign.
+        """
         return cls(
             vut=run.vut,
             folder=str(run.folder),
@@ -113,24 +117,13 @@ ORDER = list(Change)
 GOT_WORSE = (Change.BROKE, Change.WORSE)
 
 
-def passes(outcome: Outcome) -> bool:
-    """Return whether the VUT reached its goal and the case is not a failure."""
-    return outcome.is_tested and not outcome.failed
-
-
-def short(value: Any) -> Any:
-    """Return a number to the digits of a cases file, another value as it is."""
-    return float(f"{value:.6g}") if isinstance(value, float) else value
-
-
 def outcome_word(outcome: Outcome) -> str:
-    """Return how a case ended, in words."""
+    """Return the end or the severity of a case, in words.
+
+    Args:
+        outcome: the outcome of the case.
+    """
     return outcome.measures.result.lower().replace("_", " ")
-
-
-def cut(number: int, most: int) -> str:
-    """Return how many items of a list are shown, to stand after its title."""
-    return f", the first {most} of {number}" if number > most else f", {number}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,44 +131,48 @@ class ComparedCase:
     """A case that two versions ran.
 
     Attributes:
-        a: its outcome with the earlier version.
-        b: its outcome with the later one.
-        change: the change from `a` to `b`.
-        runs_a: its runs with the earlier version, of which `a` decides; None for a single run.
-        runs_b: its runs with the later version.
-        chance: p-value of Fisher's exact test of the shares of failing runs; None where the runs
+        earlier: its outcome with the earlier version.
+        later: its outcome with the later version.
+        change: the change from `earlier` to `later`.
+        earlier_runs: its runs with the earlier version, of which `earlier` decides; None for a
+            single run.
+        later_runs: its runs with the later version.
+        p_value: p-value of Fisher's exact test of the shares of failing runs; None where the runs
             with each version are alike.
     """
 
-    a: Outcome
-    b: Outcome
+    earlier: Outcome
+    later: Outcome
     change: Change
-    runs_a: RunsOfCase | None = None
-    runs_b: RunsOfCase | None = None
-    chance: float | None = None
+    earlier_runs: RunsOfCase | None = None
+    later_runs: RunsOfCase | None = None
+    p_value: float | None = None
 
     @classmethod
     def of(
-        cls, before: Sequence[Outcome], after: Sequence[Outcome], tolerated: float = 0.0
+        cls, earlier: Sequence[Outcome], later: Sequence[Outcome], tolerated: float = 0.0
     ) -> ComparedCase:
         """Compare the runs of a case with two versions.
 
         Args:
-            before: outcomes of the case with the earlier version, one a run.
-            after: outcomes with the later version.
-            tolerated: share of its runs in which a case may fail.
+            earlier: outcomes of the case with the earlier version, one for each run.
+            later: outcomes with the later version.
+            tolerated: share of its runs in which a case may fail, 0 to 1.
         """
-        a, b = one_per_case(before, tolerated)[0], one_per_case(after, tolerated)[0]
-        runs_a, runs_b = _repeated(before), _repeated(after)
-        chance = None
-        if runs_a and runs_b and (runs_a.varies or runs_b.varies):
-            chance = fisher((runs_a.failures, runs_a.runs), (runs_b.failures, runs_b.runs))
-        return cls(a, b, _change(a, b, chance), runs_a, runs_b, chance)
+        runs, other = _repeated(earlier), _repeated(later)
+        p_value = None
+        if runs and other and (runs.varies or other.varies):
+            p_value = fisher((runs.failures, runs.runs), (other.failures, other.runs))
+        a, b = one_per_case(earlier, tolerated)[0], one_per_case(later, tolerated)[0]
+        return cls(a, b, _change(a, b, p_value), runs, other, p_value)
 
     def to_record(self) -> dict[str, Any]:
         """Return the case as JSON has it."""
-        record: dict[str, Any] = {"change": self.change, "level": self.a.case.level}
-        sides = (("before", self.a, self.runs_a), ("after", self.b, self.runs_b))
+        record: dict[str, Any] = {"change": self.change, "level": self.earlier.case.level}
+        sides = (
+            ("before", self.earlier, self.earlier_runs),
+            ("after", self.later, self.later_runs),
+        )
         for name, outcome, runs in sides:
             record[f"index_{name}"], record[f"margin_{name}"] = outcome.index, outcome.margin
             record[f"end_{name}"] = outcome.measures.end
@@ -193,43 +190,30 @@ def _repeated(outcomes: Sequence[Outcome]) -> RunsOfCase | None:
     return None
 
 
-def _change(a: Outcome, b: Outcome, chance: float | None) -> Change:
-    before, after = passes(a), passes(b)
-    if before == after:
-        return Change.BOTH if before else Change.NEITHER
-    if chance is not None and chance > SIGNIFICANT:
+def _change(earlier: Outcome, later: Outcome, p_value: float | None) -> Change:
+    if earlier.passes == later.passes:
+        return Change.BOTH if later.passes else Change.NEITHER
+    if p_value is not None and p_value > SIGNIFICANT:
         return Change.WITHIN_CHANCE
-    if before:
+    if earlier.passes:
         return Change.BROKE
-    # The criterion is met, but the case is not mended.
-    is_contact = b.measures.severity == Severity.CONTACT
+    # The criterion is met, but bodies still touch.
+    is_contact = later.measures.severity == Severity.CONTACT
     return Change.STILL_CONTACT if is_contact else Change.FIXED
 
 
 def fisher(one: tuple[int, int], other: tuple[int, int]) -> float:
-    """Return the p-value of Fisher's exact test of two shares, (part, whole)."""
+    """Return the p-value of Fisher's exact test of two shares.
+
+    Args:
+        one: a share as (part, whole).
+        other: the other share.
+    """
     from scipy.stats import fisher_exact
 
     table = np.array((one, other))
     table[:, 1] -= table[:, 0]
     return float(fisher_exact(table)[1])
-
-
-def paired(
-    before: Iterable[Outcome], after: Iterable[Outcome], tolerated: float
-) -> list[ComparedCase]:
-    """Return the cases that both versions ran, in the order of tables.
-
-    Args:
-        before: outcomes of the earlier version.
-        after: outcomes of the later version.
-        tolerated: share of its runs in which a case may fail.
-    """
-    first, second = _by_start(before), _by_start(after)
-    cases = []
-    for start in first.keys() & second.keys():
-        cases.append(ComparedCase.of(first[start], second[start], tolerated))
-    return in_order(cases)
 
 
 def _by_start(outcomes: Iterable[Outcome]) -> dict[Case, list[Outcome]]:
@@ -240,51 +224,59 @@ def _by_start(outcomes: Iterable[Outcome]) -> dict[Case, list[Outcome]]:
 
 
 def in_order(cases: Iterable[ComparedCase]) -> list[ComparedCase]:
-    """Return cases in the order of tables, of each change the worst first."""
-    return sorted(cases, key=lambda c: (ORDER.index(c.change), c.b.margin or 0.0, c.b.index))
+    """Return cases in the order of tables: by change, and the lowest later margin first.
+
+    Args:
+        cases: the cases, in any order.
+    """
+    return sorted(
+        cases, key=lambda c: (ORDER.index(c.change), c.later.margin or 0.0, c.later.index)
+    )
 
 
 @dataclass(frozen=True, slots=True)
-class Step:
+class VersionChange:
     """The changes from a version to the next.
 
     Attributes:
-        before: number of the earlier version, from 1.
-        after: number of the later one.
+        number: number of the later version, from 2.
         cases: the cases that both ran, in the order of `in_order`.
-        chance: p-value of Fisher's exact test of the shares of cases that pass; None where the
+        p_value: p-value of Fisher's exact test of the shares of cases that pass; None where the
             versions ran the same cases, and where different samplers chose them.
         passes_less: whether the later version passes in a smaller share, by more than chance.
     """
 
-    before: int
-    after: int
+    number: int
     cases: list[ComparedCase]
-    chance: float | None = None
+    p_value: float | None = None
     passes_less: bool = False
 
     @property
     def transitions(self) -> dict[tuple[Change, str, str], int]:
-        """Number of cases by change, and by the outcome before and after in words."""
+        """Number of cases by change, and by the earlier and the later outcome in words."""
         found: Counter[tuple[Change, str, str]] = Counter()
         for one in self.cases:
-            found[one.change, outcome_word(one.a), outcome_word(one.b)] += 1
+            found[one.change, outcome_word(one.earlier), outcome_word(one.later)] += 1
         return found
 
     def count(self, change: Change) -> int:
-        """Return the number of cases with a change."""
+        """Return the number of cases with a change.
+
+        Args:
+            change: the change.
+        """
         return sum(case.change is change for case in self.cases)
 
     def to_record(self) -> dict[str, Any]:
-        """Return the step as JSON has it, without the cases that pass with both versions."""
+        """Return the changes as JSON has them, without the cases that pass with both versions."""
         transitions = []
         for (change, before, after), number in self.transitions.items():
             row = {"change": change, "before": before, "after": after, "cases": number}
             transitions.append(row)
         return {
-            "before": self.before,
-            "after": self.after,
-            "chance": self.chance,
+            "before": self.number - 1,
+            "after": self.number,
+            "chance": self.p_value,
             "passes_less": self.passes_less,
             "transitions": transitions,
             "cases": [one.to_record() for one in self.cases if one.change is not Change.BOTH],
@@ -301,7 +293,7 @@ class Comparison(Result):
 
     Attributes:
         versions: the versions.
-        steps: the changes.
+        version_changes: the changes, one for each version but the first.
         source: a sentence on the origin of the cases.
         notes: sentences on the limits of the comparison.
         page_command: the command that writes its page, with both motions of the cases.
@@ -309,7 +301,7 @@ class Comparison(Result):
     """
 
     versions: tuple[Version, ...]
-    steps: tuple[Step, ...]
+    version_changes: tuple[VersionChange, ...]
     source: str
     notes: tuple[str, ...] = ()
     page_command: str = ""
@@ -317,8 +309,8 @@ class Comparison(Result):
 
     @property
     def broke(self) -> int:
-        """Number of cases that broke in some step."""
-        return sum(step.count(Change.BROKE) for step in self.steps)
+        """Number of cases that broke, over all versions."""
+        return sum(one.count(Change.BROKE) for one in self.version_changes)
 
     @property
     def is_good(self) -> bool:
@@ -328,8 +320,8 @@ class Comparison(Result):
     @property
     def worse(self) -> bool:
         """Whether a case got worse, a version passes less often, or the last one tested no case."""
-        for step in self.steps:
-            if step.passes_less or any(map(step.count, GOT_WORSE)):
+        for one in self.version_changes:
+            if one.passes_less or any(map(one.count, GOT_WORSE)):
                 return True
         return not any(outcome.is_tested for outcome in self.versions[-1].outcomes)
 
@@ -340,13 +332,16 @@ class Comparison(Result):
             "broke": self.broke,
             "source": self.source,
             "versions": [version.to_record() for version in self.versions],
-            "steps": [step.to_record() for step in self.steps],
+            "steps": [one.to_record() for one in self.version_changes],
             "notes": list(self.notes),
         }
 
 
 def compare(runs: Sequence[RecordedCampaign]) -> Comparison:
-    """Compare recorded campaigns, the oldest first; nothing runs.
+    """Compare recorded campaigns; nothing runs.
+
+    Args:
+        runs: two campaigns or more, the oldest first.
 
     Raises:
         UserError: for fewer than two campaigns, and where they differ in the scenario, the
@@ -359,6 +354,9 @@ def compare(runs: Sequence[RecordedCampaign]) -> Comparison:
     versions = list(map(Version.of, runs))
     if not versions[0].at.keys() & versions[1].at.keys():
         raise UserError(f"{runs[0].folder} and {runs[1].folder} have no POV level in common")
+    changes = []
+    for number in range(2, len(versions) + 1):
+        changes.append(_version_change(number, *versions[number - 2 : number]))
     notes = []
     if len({(run.settings.sampler, run.settings.cases) for run in runs}) > 1:
         notes.append(
@@ -368,7 +366,7 @@ def compare(runs: Sequence[RecordedCampaign]) -> Comparison:
     notes += [f"{run.folder}: {run.interruption}" for run in runs if run.interruption]
     return Comparison(
         versions=tuple(versions),
-        steps=tuple(_step(versions, number) for number in range(1, len(versions))),
+        version_changes=tuple(changes),
         source=(
             "each campaign has the cases of its own search; `merge-sumo rerun` pairs the cases of "
             "one with another VUT"
@@ -381,29 +379,31 @@ def compare(runs: Sequence[RecordedCampaign]) -> Comparison:
 def compare_against(run: RecordedCampaign) -> Comparison | None:
     """Compare the VUT of a campaign with the earlier version of `--against`, in the same cases.
 
+    Args:
+        run: the campaign.
+
     Returns:
         The comparison; None for a campaign without an earlier version.
     """
-    earlier = run.earlier()
-    if earlier is None:
+    recorded = run.earlier()
+    if recorded is None:
         return None
-    before = Version.of(earlier)
     # An interrupted campaign may have more cases of the earlier version.
-    outcomes = earlier.outcomes[: len(run.outcomes)]
-    before = replace(before, outcomes=outcomes, tolerated=run.tolerated)
+    outcomes = recorded.outcomes[: len(run.outcomes)]
+    earlier = replace(Version.of(recorded), outcomes=outcomes, tolerated=run.tolerated)
     source = f"both ran the same cases, which the search chose where {run.vut} alone may fail"
-    return of_two(before, Version.of(run), source)
+    return of_two(earlier, Version.of(run), source)
 
 
-def of_two(before: Version, after: Version, source: str) -> Comparison:
+def of_two(earlier: Version, later: Version, source: str) -> Comparison:
     """Return the comparison of two versions that ran the same cases.
 
     Args:
-        before: the earlier version.
-        after: the later version.
+        earlier: the earlier version.
+        later: the later version.
         source: a sentence on the origin of the cases.
     """
-    return Comparison((before, after), (_step((before, after), 1),), source)
+    return Comparison((earlier, later), (_version_change(2, earlier, later),), source)
 
 
 def _check_comparable(a: RecordedCampaign, b: RecordedCampaign) -> None:
@@ -412,7 +412,7 @@ def _check_comparable(a: RecordedCampaign, b: RecordedCampaign) -> None:
         "what counts as a failure": a.criterion != b.criterion,
         "the share of its runs in which a case may fail": a.tolerated != b.tolerated,
     }
-    for level in sorted(set(a.levels) & set(b.levels)):
+    for level in sorted({*a.levels} & {*b.levels}):
         name = f"the POV of level {level_name(level)}"
         differs[name] = not same_pov(a.record, b.record, level)
     for name, is_different in differs.items():
@@ -422,17 +422,19 @@ def _check_comparable(a: RecordedCampaign, b: RecordedCampaign) -> None:
             )
 
 
-def _step(versions: Sequence[Version], after: int) -> Step:
-    """Return the changes to the version with an index from the one before it."""
-    earlier, later = versions[after - 1], versions[after]
-    step = Step(after, after + 1, paired(earlier.outcomes, later.outcomes, later.tolerated))
+def _version_change(number: int, earlier: Version, later: Version) -> VersionChange:
+    """Return the changes to the version with a number from the one before it."""
+    first, second = _by_start(earlier.outcomes), _by_start(later.outcomes)
+    cases = []
+    for start in first.keys() & second.keys():
+        cases.append(ComparedCase.of(first[start], second[start], later.tolerated))
+    found = VersionChange(number, in_order(cases))
     levels = earlier.at.keys() & later.at.keys()
-    before = _at_levels(earlier, levels)
-    now = _at_levels(later, levels)
-    has_own = len(step.cases) < max(len(before), len(now))
+    earlier_cases, later_cases = _at_levels(earlier, levels), _at_levels(later, levels)
+    has_own = len(cases) < max(len(earlier_cases), len(later_cases))
     if has_own and earlier.sampler == later.sampler:
-        return with_shares(step, before, now)
-    return step
+        return with_shares(found, earlier_cases, later_cases)
+    return found
 
 
 def _at_levels(version: Version, levels: Container[int]) -> list[Outcome]:
@@ -441,15 +443,20 @@ def _at_levels(version: Version, levels: Container[int]) -> list[Outcome]:
     return [outcome for outcome in cases if outcome.case.level in levels]
 
 
-def with_shares(step: Step, earlier: Sequence[Outcome], later: Sequence[Outcome]) -> Step:
-    """Return a step with the comparison of the shares of cases that pass.
+def with_shares(
+    version_change: VersionChange, earlier: Sequence[Outcome], later: Sequence[Outcome]
+) -> VersionChange:
+    """Return a change of version with the test of the shares of cases that pass.
 
     Args:
-        step: the step.
-        earlier: outcomes of the earlier version, one a case.
+        version_change: the change of version.
+        earlier: outcomes of the earlier version, one for each case.
         later: outcomes of the later version.
     """
-    passed_a, passed_b = sum(map(passes, earlier)), sum(map(passes, later))
-    chance = fisher((passed_a, len(earlier)), (passed_b, len(later)))
-    is_less = passed_b * len(earlier) < passed_a * len(later)
-    return replace(step, chance=chance, passes_less=is_less and chance <= SIGNIFICANT)
+    shares = []
+    for outcomes in (earlier, later):
+        shares.append((sum(outcome.passes for outcome in outcomes), len(outcomes)))
+    p_value = fisher(*shares)
+    (passed, number), (later_passed, later_number) = shares
+    is_less = later_passed * number < passed * later_number
+    return replace(version_change, p_value=p_value, passes_less=is_less and p_value <= SIGNIFICANT)

@@ -1,7 +1,7 @@
-"""Counterfactuals: which drivers would have avoided a failure, in the very same case.
+"""Counterfactuals: the drivers that would have avoided a failure, in the very same case.
 
-The failing cases of a campaign run again, without any code of the VUT: with each reference driver
-in the VUT's place, with a driver that takes over at some step, and with a careful POV.
+The failing cases of a campaign run again without the VUT: with each reference driver in its place,
+with a reference driver that takes over at some step, and with a careful POV.
 """
 
 # Each step is tried for a takeover, from the last one back to the first success: success is not
@@ -21,17 +21,14 @@ from typing import Any, Literal
 import numpy as np
 
 from merge_sumo.analysis.run_study import RunStudy, StudyFile
-from merge_sumo.campaigns.recorded import RecordedCampaign, failures
+from merge_sumo.campaigns.recorded import failures
 from merge_sumo.controllers.kinds import load
 from merge_sumo.controllers.process import LOG
 from merge_sumo.drivers.base import MERGE, STAY, Driver, DriverWrapper, Scene
 from merge_sumo.drivers.lane import follow_mps2
 from merge_sumo.drivers.levelk import DECISION_STEPS
 from merge_sumo.drivers.reference import REFERENCES, CarefulPov
-from merge_sumo.metrics.cause import cause
 from merge_sumo.metrics.merge import brake_after_mps2
-from merge_sumo.metrics.outcome import Outcome
-from merge_sumo.printable import either
 from merge_sumo.records import Record
 from merge_sumo.road.loader import centre_lines
 from merge_sumo.scenario.case import Case, FloatArray
@@ -42,9 +39,9 @@ from merge_sumo.simulation.plan import Engine, SimulationPlan
 from merge_sumo.simulation.rollout import RING_ROWS, Rollout
 from merge_sumo.simulation.simulator import Simulator
 
-CAREFUL, TAKES_OVER = "careful", "fsm"
-"""Reference drivers: the careful one, and the one that takes over, which reacts at once. The first
-one brakes only 2 s before a collision."""
+TAKES_OVER = "fsm"
+"""The reference driver that takes over: it reacts at once. The driver `careful` brakes only 2 s
+before a collision, so its latest takeover would describe this rule and not the VUT."""
 MOST = 500
 """Maximum number of failures that run again, the worst: each takes some thirty episodes."""
 BLOCK_STEPS = 10
@@ -52,15 +49,14 @@ BLOCK_STEPS = 10
 
 
 class Avoidance(Record, frozen=True):
-    """Which drivers would have avoided a failure.
+    """The drivers that would have avoided a failure.
 
     Attributes:
         index: of the case in its campaign.
         avoided_by: names of the reference drivers that pass the case in the VUT's place.
-        latest_takeover_s: the last time at which the FSM driver, taking over, passes it; None where
-            there is no such time, and where a version up to 0.1.0 made the record.
-        pov_careful: whether a careful driver on the mainline would have avoided it against what
-            the VUT did.
+        latest_takeover_s: the last time at which the driver `TAKES_OVER` may take over and passes
+            the case; None without such a time, and in records of versions up to 0.1.0.
+        pov_careful: whether a careful POV avoids the failure against the recorded VUT.
     """
 
     index: int
@@ -68,62 +64,29 @@ class Avoidance(Record, frozen=True):
     latest_takeover_s: EpisodeTime | None
     pov_careful: bool
 
-    @property
-    def clause(self) -> str:
-        """The drivers that would have avoided the failure, in words."""
-        by = either(self.avoided_by) if self.avoided_by else "no reference driver"
-        text = f"in the place of the VUT {by} would have avoided it"
-        if self.latest_takeover_s is not None:
-            text += f", {TAKES_OVER} by taking over until {self.latest_takeover_s:.1f} s"
-        return f"{text}; so would a careful POV" if self.pov_careful else text
-
 
 AVOIDANCE = StudyFile("avoidance.jsonl", Avoidance)
 """A line for each failure, up to `MOST`."""
 
 
-def causes(run: RecordedCampaign, outcomes: Sequence[Outcome]) -> dict[int, str]:
-    """Return the causes of cases of a campaign by index, with the drivers that avoid them."""
-    motions = run.trajectories(outcome.index for outcome in outcomes)
-    clauses = {one.index: one.clause for one in AVOIDANCE.read_lines(run)}
-    found = {}
-    for outcome in outcomes:
-        index = outcome.index
-        found[index] = cause(outcome, motions.get(index), clauses.get(index, ""))
-    return found
-
-
-Failure = tuple[int, Trajectory]
-"""The index of a failing case, and its recorded motion."""
-
-
-def note_avoidance(study: RunStudy, on_part: Callable[[int, int], None]) -> None:
-    """Write which drivers would have avoided each failure of a campaign, if it has any.
-
-    Args:
-        study: the campaign, and how it ran.
-        on_part: called with the number of failures that are done, and of all; may raise.
-    """
-    found = avoidance(study, on_part)
-    if found:
-        AVOIDANCE.write_lines(study.run.folder, found)
-
-
-def avoidance(
+def write_avoidance(
     study: RunStudy, on_part: Callable[[int, int], None] = lambda _done, _total: None
 ) -> list[Avoidance]:
-    """Return which drivers would have avoided the worst failures, in the order of the cases.
+    """Write which drivers would have avoided the worst failures of a campaign, if it has any.
 
     Failures whose trajectory is lost, and those that end a worker each time, are left out.
 
     Args:
-        study: the campaign, and how it ran.
+        study: the campaign, and how its cases run.
         on_part: called with the number of failures that are done, and of all; may raise.
+
+    Returns:
+        The lines of the file, in the order of the cases.
     """
     run = study.run
     worst = [outcome.index for outcome in failures(run.cases)[:MOST]]
     failing = list(run.trajectories(sorted(worst)).items())
-    # No code of the VUT: a driver of the package is in its place.
+    # A simulator opens the VUT of its plan. This one never drives: `_Substitutes` does.
     plan = replace(study.plan, vut=load(TAKES_OVER)).for_verdicts().with_engine(None)
     plan = plan.with_log(run.folder.resolve() / LOG)
     results = study.workers.run(partial(avoidances, plan), failing, lambda _: None)
@@ -132,6 +95,8 @@ def avoidance(
         if one is not None:
             found.append(one)
         on_part(done, len(failing))
+    if found:
+        AVOIDANCE.write_lines(run.folder, found)
     return found
 
 
@@ -139,33 +104,45 @@ def avoidance(
 class Counterfactual(Case):
     """A failing case with another driver.
 
+    It is a `Case` because a rollout begins an episode of both drivers with its case: the drivers
+    below read the attributes from it.
+
     Attributes:
         failure: the recorded motion.
-        by: reference driver in the place of the VUT.
-        first: step at which the episode begins, with the recorded state.
+        by: name of the reference driver in the place of the VUT.
+        first: step of the recorded motion at which the episode begins.
         until: step up to which the VUT moves as recorded.
         careful_pov: whether a careful driver is in the place of the POV.
     """
 
     failure: Trajectory = field(compare=False, repr=False)
-    by: str = CAREFUL
+    by: str = TAKES_OVER
     first: int = 0
     until: int = 0
     careful_pov: bool = False
 
     @classmethod
     def of(cls, failure: Trajectory, **other: Any) -> Counterfactual:
-        """Return the case of a failure with other attributes."""
+        """Return the case of a failure with another driver.
+
+        Args:
+            failure: the recorded motion.
+            other: attributes other than those of the case.
+        """
         for one in fields(failure.case):
             other[one.name] = getattr(failure.case, one.name)
         return cls(failure=failure, **other)
 
     def starts(self) -> list[tuple[float, float]]:
-        """Return position and speed of every vehicle where the episode begins."""
+        """Return position and speed of every vehicle where the episode begins, in m and m/s."""
         return [(x, v) for x, v, _ in self.failure.motion[self.first].tolist()]
 
     def from_the_start(self, trajectory: Trajectory) -> Trajectory:
-        """Return the trajectory of the episode with the steps before it."""
+        """Return the trajectory of the episode with the steps before it.
+
+        Args:
+            trajectory: the trajectory from step `first` on.
+        """
         if not self.first:
             return trajectory
         motion = np.concatenate((self.failure.motion[: self.first], trajectory.motion))
@@ -173,67 +150,74 @@ class Counterfactual(Case):
         return replace(trajectory, motion=motion, end=End.TIMEOUT if late else trajectory.end)
 
 
-def avoidances(plan: SimulationPlan, failing: Sequence[Failure]) -> list[Avoidance]:
-    """Return which drivers would have avoided failures, by running their cases in this process."""
+def avoidances(plan: SimulationPlan, failing: Sequence[tuple[int, Trajectory]]) -> list[Avoidance]:
+    """Return which drivers would have avoided failures, by running their cases in this process.
+
+    Args:
+        plan: how the cases run; its VUT does not drive.
+        failing: index and recorded motion of each failure.
+    """
+    motions = [motion for _, motion in failing]
     cases = []
     # One driver after the other: a driver that is in no corridor costs nothing.
     for name in REFERENCES:
-        cases += [Counterfactual.of(motion, by=name) for _, motion in failing]
-    for _, motion in failing:
-        until = len(motion.motion) - 1
-        cases.append(Counterfactual.of(motion, until=until, careful_pov=True))
+        cases += [Counterfactual.of(motion, by=name) for motion in motions]
+    for motion in motions:
+        cases.append(Counterfactual.of(motion, until=_steps(motion), careful_pov=True))
     with opened_simulator(plan) as simulator:
-        passed = np.reshape(_passed(plan, simulator, cases), (-1, len(failing)))
-        latest = _latest_takeovers(plan, simulator, [motion for _, motion in failing])
+        avoided = np.reshape(_avoided(plan, simulator, cases), (-1, len(failing)))
+        latest_s = _latest_takeovers_s(plan, simulator, motions)
     found = []
     for row, (index, _) in enumerate(failing):
-        *by_name, pov_careful = passed[:, row].tolist()
+        *by_name, pov_careful = avoided[:, row].tolist()
         names = tuple(compress(REFERENCES, by_name))
-        found.append(Avoidance(index, names, latest[row], pov_careful))
+        found.append(Avoidance(index, names, latest_s[row], pov_careful))
     return found
 
 
-def _latest_takeovers(
+def _steps(motion: Trajectory) -> int:
+    """Return the number of steps of a recorded motion, which has a row more."""
+    return len(motion.motion) - 1
+
+
+def _latest_takeovers_s(
     plan: SimulationPlan, simulator: Simulator, motions: Sequence[Trajectory]
 ) -> list[float | None]:
-    """Return the last times at which a driver may take over, s; None without one."""
-    latest: list[float | None] = [None] * len(motions)
-    ends = {row: len(motion.motion) - 1 for row, motion in enumerate(motions)}
-    while ends:
+    """Return the last times at which a driver may take over, in s; None without one."""
+    latest_s: list[float | None] = [None] * len(motions)
+    for tried in range(0, max(map(_steps, motions)), BLOCK_STEPS):
         rows, cases = [], []
-        for row, end in ends.items():
+        for row, motion in enumerate(motions):
+            end = _steps(motion) - tried if latest_s[row] is None else 0
             for until in range(max(end - BLOCK_STEPS, 0), end):
                 # Learned POVs have no other memory than their last decision; a user's POV may.
                 first = 0 if plan.engine is Engine.SUMO else until - until % DECISION_STEPS
-                takeover = {"by": TAKES_OVER, "first": first, "until": until}
                 rows.append(row)
-                cases.append(Counterfactual.of(motions[row], **takeover))
-        for row, case, passed in zip(rows, cases, _passed(plan, simulator, cases), strict=True):
-            if passed:
-                latest[row] = round(case.until * DT_S, 1)  # in rising order
-        for row, end in list(ends.items()):
-            ends[row] = end - BLOCK_STEPS
-            if latest[row] is not None or ends[row] <= 0:
-                del ends[row]
-    return latest
+                cases.append(Counterfactual.of(motion, first=first, until=until))
+        for row, case, avoided in zip(rows, cases, _avoided(plan, simulator, cases), strict=True):
+            if avoided:
+                latest_s[row] = round(case.until * DT_S, 1)  # in rising order
+    return latest_s
 
 
-def _passed(
+def _avoided(
     plan: SimulationPlan, simulator: Simulator, cases: Sequence[Counterfactual]
 ) -> list[bool]:
-    """Run counterfactuals in the simulation of a simulator; return whether each passes."""
+    """Run counterfactuals in the simulation of a simulator; return whether each is no failure.
+
+    That asks more than `Outcome.passes`: the vehicle behind must also be able to brake after the
+    merge.
+    """
     simulation = simulator.simulation
     substitutes = _Substitutes(simulation.corridors)
     trajectories = Rollout(simulation, _Mainline(simulator.pov), substitutes, cases).run()
     lines = centre_lines(plan.road)
-    passed = []
+    avoided = []
     for case, trajectory in zip(cases, trajectories, strict=True):
         whole = case.from_the_start(trajectory)
-        # A merge after which the vehicle behind cannot brake hard enough avoids nothing.
         can_brake = brake_after_mps2(whole) <= -case.scenario.a_min_mps2
-        tested = can_brake and whole.end.is_tested
-        passed.append(tested and not plan.criterion.bare_outcome(whole, lines).failed)
-    return passed
+        avoided.append(can_brake and plan.criterion.bare_outcome(whole, lines).passes)
+    return avoided
 
 
 class _Substitutes(Driver):
@@ -248,8 +232,9 @@ class _Substitutes(Driver):
         self._by = np.zeros(corridors, dtype=np.int64)
         self._until = np.zeros(corridors, dtype=np.int64)
         self._recorded = np.zeros((RING_ROWS, corridors))
+        """Recorded accelerations of the VUT by step of the episode, m/s2."""
         self._merges_at = np.zeros(corridors, dtype=np.int64)
-        """Step after which the VUT of the failure was on the mainline."""
+        """Step of the episode after which the VUT of the failure was on the mainline."""
 
     def begin(self, corridor: int, case: Case) -> None:
         super().begin(corridor, case)
@@ -258,7 +243,7 @@ class _Substitutes(Driver):
         self._until[corridor] = case.until - case.first
         recorded = case.failure.a_vut_mps2[case.first : case.scenario.max_steps + 1]
         self._recorded[: len(recorded), corridor] = recorded
-        self._merges_at[corridor] = len(case.failure.motion) - 2 - case.first
+        self._merges_at[corridor] = _steps(case.failure) - 1 - case.first
         self._drivers[case.by].begin(corridor, case)
 
     def act(self, scene: Scene) -> FloatArray:
@@ -269,6 +254,7 @@ class _Substitutes(Driver):
             drives = scene.active & ~is_recorded & (self._by == number)
             if drives.any():
                 answer[drives] = driver.act(scene)[drives]
+                # `act` moved on in every corridor: those on the record have not begun.
                 driver.forget(is_recorded)
         if scene.merged is not None and scene.merged.any():
             followed = follow_mps2(scene.x_m, scene.v_mps, self.scenario)

@@ -164,7 +164,7 @@ def failure_of(run: RecordedCampaign, index: int | None) -> Outcome:
     return outcome
 
 
-def note_explanation(study: RunStudy) -> None:
+def write_worst_explanation(study: RunStudy) -> None:
     """Explain the worst failure of a campaign that has just ended, where that takes no SUMO.
 
     Nothing is written for drivers that need SUMO, nor where the engines differ.

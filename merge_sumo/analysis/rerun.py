@@ -59,72 +59,73 @@ def chosen(
     return found
 
 
-def rerun(study: RunStudy, before: Sequence[Outcome]) -> Comparison:
-    """Run cases of a campaign again, with the settings of the study and their plan.
+def rerun(study: RunStudy, recorded: Sequence[Outcome]) -> Comparison:
+    """Run cases of a campaign again, and compare them with the record.
 
     A case that changed runs once more where its controller may not repeat itself.
+
+    Args:
+        study: the campaign, and how its cases run now.
+        recorded: outcomes of the campaign, whose cases run.
 
     Raises:
         UserError: where the net or the POV are not those of the campaign.
     """
     run, settings = study.run, study.settings
     study.check_same_system(may_change=True)
-    study = replace(study, plan=study.plan.for_cases(len(before)))
+    study = replace(study, plan=study.plan.for_cases(len(recorded)))
     open_simulators(study.plan, study.workers)
-    ran = _ran(study, before, study.on_cases)
+    episodes = _episodes(study, recorded, study.on_cases)
     outcomes, motions = [], {}
-    for outcome in before:
-        outcomes.append(ran[outcome.index].outcome)
-        motions[outcome.index] = ran[outcome.index].trajectory
-    earlier = replace(Version.of(run), outcomes=before)
+    for outcome in recorded:
+        outcomes.append(episodes[outcome.index].outcome)
+        motions[outcome.index] = episodes[outcome.index].trajectory
+    earlier = replace(Version.of(run), outcomes=recorded)
     later = replace(
-        earlier,
-        vut=settings.vut,
-        folder=None,
-        outcomes=outcomes,
-        motions=lambda _indices: motions,
+        earlier, vut=settings.vut, folder=None, outcomes=outcomes, motions=lambda _indices: motions
     )
     source = (
         f"the cases come from the recorded search of {run.vut}; a campaign with `against` searches "
         "for cases that only the new version fails"
     )
     compared = of_two(earlier, later, source)
-    (step,) = compared.steps
+    (version_change,) = compared.version_changes
     cases, changed = [], []
-    for one in step.cases:
+    for one in version_change.cases:
         if isinstance(run, CasesFile):
             one = replace(one, change=run.change_of(one))  # noqa: PLW2901
         cases.append(one)
-        if one.change in AGAIN and one.runs_b is None:
-            changed.append(one.b)
-    again = _ran(study, others_drive(changed, settings))
+        if one.change in AGAIN and one.later_runs is None:
+            changed.append(one.later)
+    second_episodes = _episodes(study, others_drive(changed, settings))
     repeats = []
     for row, one in enumerate(cases):
-        second = again.get(one.b.index)
+        second = second_episodes.get(one.later.index)
         if second is None:
             continue
-        repeats.append(repeat_of(one.b, motions[one.b.index], second))
+        repeats.append(repeat_of(one.later, motions[one.later.index], second))
         # Where the VUT reaches its goal neither time, the change is not chance.
-        if not repeats[-1].same and (one.b.is_tested or second.outcome.is_tested):
+        if not repeats[-1].same and (one.later.is_tested or second.outcome.is_tested):
             cases[row] = replace(one, change=Change.NOT_REPEATABLE)
-    step = replace(step, cases=in_order(cases))
+    version_change = replace(version_change, cases=in_order(cases))
     notes = []
     if warning := unrepeatable(repeats):
         notes.append(warning)
-    if number := step.count(Change.NOT_REPEATABLE):
-        step = with_shares(step, before, outcomes)
+    if number := version_change.count(Change.NOT_REPEATABLE):
+        version_change = with_shares(version_change, recorded, outcomes)
         notes.append(
             f"Not counted one by one, as it may be chance: {counted(number, 'change')}. Draw "
             "random numbers from the seed of the case, as `reset(seen, seed)` tells it in Python, "
             "or compare campaigns of both versions with `repeat`"
         )
-    differing = [one.b.index for one in step.cases if one.change is not Change.BOTH]
+    differing = [one.later.index for one in version_change.cases if one.change is not Change.BOTH]
     drivers = {"vut": settings.vut, "pov": settings.pov}
     page = command("rerun", run.folder, differing[:LISTED], **drivers, out=free(PAGE))
-    return replace(compared, steps=(step,), notes=tuple(notes), page_command=page)
+    changes = (version_change,)
+    return replace(compared, version_changes=changes, notes=tuple(notes), page_command=page)
 
 
-def _ran(
+def _episodes(
     study: RunStudy, outcomes: Sequence[Outcome], on_cases: Callable[[int], None] = lambda _: None
 ) -> dict[int, Episode]:
     """Run the cases of outcomes again; return their episodes by index."""

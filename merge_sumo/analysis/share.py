@@ -97,7 +97,7 @@ def own_shares(run: RecordedCampaign) -> list[LevelShare]:
     return shares
 
 
-def note_shares(
+def write_shares(
     study: RunStudy, on_part: Callable[[int, int], None] = lambda _done, _total: None
 ) -> None:
     """Measure the share that fails at each level of a campaign that has just ended.

@@ -122,6 +122,11 @@ class Outcome:
         return self.measures.end.is_tested or self.failed
 
     @property
+    def passes(self) -> bool:
+        """Whether the VUT reached the merge point, and the case is not a failure."""
+        return self.is_tested and not self.failed
+
+    @property
     def signed_gap(self) -> float | None:
         """The gap at M in units of the scenario's limit; a case fails within -1 to 1.
 

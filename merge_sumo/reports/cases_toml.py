@@ -12,8 +12,15 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
-from merge_sumo.analysis.cases_file import TOLERANCE, CasesFile, Head, policies_of, verdict_of
-from merge_sumo.analysis.comparison import GOT_WORSE, Comparison, passes, short
+from merge_sumo.analysis.cases_file import (
+    TOLERANCE,
+    CasesFile,
+    Head,
+    policies_of,
+    short,
+    verdict_of,
+)
+from merge_sumo.analysis.comparison import GOT_WORSE, Comparison
 from merge_sumo.campaigns.recorded import RecordedCampaign, spread_failures
 from merge_sumo.errors import notice
 from merge_sumo.files import check_new, make_folder, write_new
@@ -45,7 +52,7 @@ def with_file(compared: Comparison, file: CasesFile, path: Path) -> Comparison:
         file: the cases file.
         path: place of a file with the current text.
     """
-    (step,), (_, now) = compared.steps, compared.versions
+    (version_change,), (_, now) = compared.version_changes, compared.versions
     outcomes = {one.index: one for one in (*file.outcomes, *now.outcomes)}
     before = cases_toml(file, file.outcomes, path, file.settings.vut)
     text = cases_toml(file, outcomes.values(), path, now.vut)
@@ -53,14 +60,14 @@ def with_file(compared: Comparison, file: CasesFile, path: Path) -> Comparison:
     for old, new in zip(before.splitlines(), text.splitlines(), strict=True):
         if old != new:
             notes += [f"- {old.strip()}", f"+ {new.strip()}"]
-    for one in step.cases:
-        index = one.b.index
+    for one in version_change.cases:
+        index = one.later.index
         reason = file.accepted.get(index)
         if one.change in GOT_WORSE:
-            why = cause(one.b, now.motions([index]).get(index))
+            why = cause(one.later, now.motions([index]).get(index))
             notes.append(f"case {index}, {one.change}: {why}")
         elif reason:
-            result = "passes now: take the mark away" if passes(one.b) else "fails, not counted"
+            result = "passes now: take the mark away" if one.later.passes else "fails, not counted"
             notes.append(f"case {index} is accepted ({reason}) and {result}")
     if not any(one.is_tested for one in now.outcomes):
         notes.append(judge(now.outcomes).nothing_tested)
@@ -81,7 +88,7 @@ def watching(run: RecordedCampaign) -> list[Outcome]:
     failing = spread_failures(cases)
     chosen = failing[: MOST // 4]
     for turn, level in product(range(MOST), run.levels):
-        left = [o for o in cases if o.case.level == level and passes(o) and o not in chosen]
+        left = [o for o in cases if o.case.level == level and o.passes and o not in chosen]
         if not left or len(chosen) == MOST:
             continue
         known = to_unit((o.case for o in chosen if o.case.level == level), level, scenario)
@@ -181,7 +188,7 @@ def _line(run: RecordedCampaign, outcome: Outcome) -> str:
     record = outcome.to_record() | {"margin": outcome.margin, "verdict": verdict_of(outcome)}
     if outcome.measures.end.is_tested:
         record["end"] = None
-    if isinstance(run, CasesFile) and not passes(outcome):
+    if isinstance(run, CasesFile) and not outcome.passes:
         record["accepted"] = run.accepted.get(outcome.index)
     names = ["index", "level", "verdict", "end", "severity", "margin"]
     if not run.criterion.require:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from merge_sumo.analysis.comparison import Change, Comparison, Step, compare_against
+from merge_sumo.analysis.comparison import Change, Comparison, VersionChange, compare_against
 from merge_sumo.campaigns.recorded import AGAINST, RecordedCampaign
 from merge_sumo.files import GENERATOR, replace_own
 from merge_sumo.metrics.cause import cause
@@ -18,7 +18,7 @@ from merge_sumo.scenario.case import FloatArray, coordinates
 from merge_sumo.scenario.scenario import DT_S, VEHICLES, VUT
 
 SHOWN = 200
-"""Cases of a step that are drawn, those first that broke; of more, a heading says how many."""
+"""Maximum number of cases of a change of version that are drawn, in the order of tables."""
 DRAWN = (
     *(Change.BROKE, Change.WITHIN_CHANCE, Change.NOT_REPEATABLE, Change.NEITHER),
     *(Change.STILL_CONTACT, Change.FIXED),
@@ -42,7 +42,7 @@ def write_against(run: RecordedCampaign) -> None:
 
 def comparison_page(compared: Comparison) -> str:
     """Return the page of a comparison as HTML."""
-    steps = [(step, _maps(step), _sections(step, compared)) for step in compared.steps]
+    rows = [(one, _maps(one), _sections(one, compared)) for one in compared.version_changes]
     vehicles = max(
         outcome.case.scenario.vehicles
         for version in compared.versions
@@ -56,23 +56,23 @@ def comparison_page(compared: Comparison) -> str:
         counts=[judge(one.outcomes, one.tolerated).counts for one in compared.versions],
         fmc=fmc_rows(compared),
         change_in_words=change_in_words,
-        steps=steps,
+        version_changes=rows,
         vehicles=vehicles,
     )
 
 
-def _maps(step: Step) -> dict[int, Any]:
+def _maps(version_change: VersionChange) -> dict[int, Any]:
     """Return by level its coordinates, and where cases changed; those that broke lie on top."""
     maps: dict[int, Any] = {}
-    for one in reversed(step.cases):
+    for one in reversed(version_change.cases):
         if one.change in DRAWN:
-            case = one.a.case
+            case = one.earlier.case
             axes = coordinates(case.scenario, (case.level,))
             maps.setdefault(case.level, (axes, []))[1].append((one.change, case))
     return dict(sorted(maps.items()))
 
 
-def _sections(step: Step, compared: Comparison) -> list[tuple[Change, int, Any]]:
+def _sections(version_change: VersionChange, compared: Comparison) -> list[tuple[Change, int, Any]]:
     """Return a section for each change: the change, its number of cases, a row for each case shown.
 
     A row has the case, its versions (number, folder, outcome, cause), the charts, and the time of
@@ -80,15 +80,17 @@ def _sections(step: Step, compared: Comparison) -> list[tuple[Change, int, Any]]
     """
     sections, left = [], SHOWN
     for change in DRAWN:
-        cases = [case for case in step.cases if case.change is change]
+        cases = [case for case in version_change.cases if case.change is change]
         shown = cases[:left]
         left -= len(shown)
         rows = []
         for one in shown:
             versions, motions = [], {}
-            sides = (("earlier", step.before, one.a), ("later", step.after, one.b))
-            for name, number, outcome in sides:
-                version = compared.versions[number - 1]
+            for name, number in (
+                ("earlier", version_change.number - 1),
+                ("later", version_change.number),
+            ):
+                outcome, version = getattr(one, name), compared.versions[number - 1]
                 motion = version.motions([outcome.index]).get(outcome.index)
                 versions.append((number, version.folder, outcome, cause(outcome, motion)))
                 if motion is not None:

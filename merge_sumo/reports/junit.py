@@ -6,8 +6,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from merge_sumo.analysis.comparison import GOT_WORSE, Change, Comparison, Step, compare_against
-from merge_sumo.analysis.counterfactuals import causes
+from merge_sumo.analysis.comparison import (
+    GOT_WORSE,
+    Change,
+    Comparison,
+    VersionChange,
+    compare_against,
+)
 from merge_sumo.campaigns.recorded import NAME_CHARACTERS, RecordedCampaign
 from merge_sumo.errors import UserError
 from merge_sumo.files import check_new, write_new
@@ -15,7 +20,7 @@ from merge_sumo.metrics.summary import GateResult, Verdict, by_case, undecided
 from merge_sumo.printable import printable
 from merge_sumo.reports.facts import Fact, by_level
 from merge_sumo.reports.pages import environment
-from merge_sumo.reports.text import change_in_words, step_headline
+from merge_sumo.reports.text import causes, change_in_words, version_change_headline
 from merge_sumo.scenario.case import described
 from merge_sumo.scenario.scenario import level_name
 
@@ -88,7 +93,7 @@ def write_junit(
     compared = compare_against(run)
     if compared is not None:
         earlier = printable(str(run.settings.against)[:NAME_CHARACTERS])
-        suites[f"against {earlier}"] = _step(compared.steps[0])
+        suites[f"against {earlier}"] = _tests(compared.version_changes[0])
     for level in by_level(facts):
         suites[f"POV level {level_name(level)}"] = []
     for test in _cases(run):
@@ -99,10 +104,10 @@ def write_junit(
 def write_junit_of_comparison(path: Path, compared: Comparison) -> None:
     """Write the JUnit file of a comparison; `UserError` when it exists or cannot be written."""
     suites = {}
-    for step in compared.steps:
-        before, after = compared.versions[step.before - 1], compared.versions[step.after - 1]
-        name = printable(f"{before.folder} to {after.folder or after.vut}")
-        suites[name] = _step(step, every=compared.text is not None)
+    for version_change in compared.version_changes:
+        earlier, later = compared.versions[version_change.number - 2 :][:2]
+        name = printable(f"{earlier.folder} to {later.folder or later.vut}")
+        suites[name] = _tests(version_change, every=compared.text is not None)
     _write(path, "merge-sumo compare", suites)
 
 
@@ -137,18 +142,18 @@ def _cases(run: RecordedCampaign) -> list[TestCase]:
     return tests
 
 
-def _step(step: Step, *, every: bool = False) -> list[TestCase]:
+def _tests(version_change: VersionChange, *, every: bool = False) -> list[TestCase]:
     """Return the cases that changed, or all that two versions ran."""
     tests = []
-    if step.passes_less:
+    if version_change.passes_less:
         test = TestCase("share of cases that pass", "against", 0.0, "failure", REGRESSION)
-        test.message = step_headline(step)
+        test.message = version_change_headline(version_change)
         tests.append(test)
-    for one in step.cases:
+    for one in version_change.cases:
         if one.change is Change.BOTH and not every:
             continue
-        name = f"case {one.b.index}: {described(one.b.case)}"
-        test = TestCase(name, "against", one.b.measures.t_end_s)
+        name = f"case {one.later.index}: {described(one.later.case)}"
+        test = TestCase(name, "against", one.later.measures.t_end_s)
         if one.change in GOT_WORSE:
             test.tag, test.kind, test.message = "failure", REGRESSION, change_in_words(one)
         elif one.change in (Change.ACCEPTED, Change.NOT_REPEATABLE):

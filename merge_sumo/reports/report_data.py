@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from merge_sumo.analysis.counterfactuals import causes
 from merge_sumo.analysis.surface import Grid, Surface, nodes
 from merge_sumo.metrics.fmc import fmc_growth, radius_for
 from merge_sumo.metrics.measures import measures_in
@@ -19,7 +18,7 @@ from merge_sumo.printable import printable
 from merge_sumo.records import to_plain
 from merge_sumo.reports.pages import ERROR_CHARACTERS
 from merge_sumo.reports.report_model import ReportModel
-from merge_sumo.reports.text import changes, name_and_unit
+from merge_sumo.reports.text import causes, changes, name_and_unit
 from merge_sumo.road.drawing import road_data
 from merge_sumo.scenario.case import FloatArray, to_unit
 from merge_sumo.scenario.scenario import ALL_LEVELS, DT_S, VEHICLES, level_name

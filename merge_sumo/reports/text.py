@@ -9,18 +9,16 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
+from merge_sumo.analysis.cases_file import short
 from merge_sumo.analysis.comparison import (
     LISTED,
     Change,
     ComparedCase,
     Comparison,
-    Step,
-    cut,
+    VersionChange,
     outcome_word,
-    passes,
-    short,
 )
-from merge_sumo.analysis.counterfactuals import causes
+from merge_sumo.analysis.counterfactuals import AVOIDANCE, TAKES_OVER, Avoidance
 from merge_sumo.analysis.explanation import PSI, Axis, Explanation, ExplanationResult
 from merge_sumo.analysis.probability import Estimate, PerMerge, ProbabilityResult
 from merge_sumo.analysis.reproduction import ADAPTIVE, SAMPLERS, Reproduction
@@ -75,6 +73,16 @@ def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
         cells = [cell.rjust(width) for cell, width in zip(row, widths, strict=True) if width]
         lines.append("  ".join(cells).rstrip())
     return lines
+
+
+def cut(number: int, most: int) -> str:
+    """Return how many items of a list are shown, to stand after its title.
+
+    Args:
+        number: number of all items.
+        most: maximum number of items that are shown.
+    """
+    return f", the first {most} of {number}" if number > most else f", {number}"
 
 
 # Campaigns
@@ -145,31 +153,33 @@ def _level_cells(level: int, of: Mapping[str, Fact]) -> list[str]:
 
 def change_in_words(case: ComparedCase) -> str:
     """Return both outcomes of a case in words, with the runs of each where there are several."""
-    if case.chance is not None and case.runs_a is not None and case.runs_b is not None:
-        shares = f"{case.runs_a.in_words} -> {case.runs_b.in_words}"
-        return f"{shares}, by Fisher's exact test p = {case.chance:.2g}"
-    words = [outcome_word(case.a), outcome_word(case.b)]
+    if case.p_value is not None and case.earlier_runs is not None and case.later_runs is not None:
+        shares = f"{case.earlier_runs.in_words} -> {case.later_runs.in_words}"
+        return f"{shares}, by Fisher's exact test p = {case.p_value:.2g}"
+    words = [outcome_word(case.earlier), outcome_word(case.later)]
     if words[0] == words[1] and case.change is not Change.BOTH:
-        for place, outcome in enumerate((case.a, case.b)):
+        for place, outcome in enumerate((case.earlier, case.later)):
             if case.change in (Change.WORSE, Change.NOT_REPEATABLE):
                 words[place] += f", margin {short(outcome.margin)}"
             else:
-                words[place] += ", no failure" if passes(outcome) else ", a failure"
+                words[place] += ", no failure" if outcome.passes else ", a failure"
     return " -> ".join(words)
 
 
-def step_headline(step: Step) -> str:
-    """Return the numbers of a step in a sentence: cases by their change."""
+def version_change_headline(version_change: VersionChange) -> str:
+    """Return the numbers of a change of version in a sentence: cases by their change."""
     parts = []
-    if step.passes_less:
-        by = f"by Fisher's exact test p = {step.chance:.2g}"
-        parts.append(f"{step.after} passes less often than {step.before}, {by}")
-    if step.cases:
+    if version_change.passes_less:
+        by = f"by Fisher's exact test p = {version_change.p_value:.2g}"
+        parts.append(
+            f"{version_change.number} passes less often than {version_change.number - 1}, {by}"
+        )
+    if version_change.cases:
         numbers = []
         for change in Change:
-            if step.count(change) or change is Change.BROKE:
-                numbers.append(f"{step.count(change)} {change}")
-        parts.append(f"of {counted(len(step.cases), 'shared case')} {', '.join(numbers)}")
+            if version_change.count(change) or change is Change.BROKE:
+                numbers.append(f"{version_change.count(change)} {change}")
+        parts.append(f"of {counted(len(version_change.cases), 'shared case')} {', '.join(numbers)}")
     else:
         parts.append("no case is shared")
     return "; ".join(parts)
@@ -178,9 +188,13 @@ def step_headline(step: Step) -> str:
 def comparison_headline(compared: Comparison) -> str:
     """Return the failures of each version, and how much broke and was fixed, in a sentence."""
     parts = [" -> ".join(judge(one.outcomes, one.tolerated).counts for one in compared.versions)]
-    for step in compared.steps:
-        between = f"from {step.before} to {step.after}: " if len(compared.steps) > 1 else ""
-        parts.append(between + step_headline(step))
+    for version_change in compared.version_changes:
+        between = (
+            f"from {version_change.number - 1} to {version_change.number}: "
+            if len(compared.version_changes) > 1
+            else ""
+        )
+        parts.append(between + version_change_headline(version_change))
     return "; ".join(parts)
 
 
@@ -197,7 +211,7 @@ def fmc_rows(compared: Comparison) -> dict[int, list[str]]:
 
 @lines_of.register
 def comparison(compared: Comparison) -> list[str]:
-    """Return the numbers, version by version and step by step, and the first of the cases."""
+    """Return the numbers, of each version and of each change, and the first of the cases."""
     text = [comparison_headline(compared)]
     if compared.text is not None:
         return [*text, *compared.notes]
@@ -211,34 +225,34 @@ def comparison(compared: Comparison) -> list[str]:
     for level, row in fmc_rows(compared).items():
         text.append(f"level {level_name(level)}: FMC {' -> '.join(row)}")
     differ = False
-    for step in compared.steps:
-        text += _step_lines(step)
-        differ |= step.count(Change.BOTH) < len(step.cases)
+    for version_change in compared.version_changes:
+        text += _version_change_lines(version_change)
+        differ |= version_change.count(Change.BOTH) < len(version_change.cases)
     if differ and compared.page_command:
         text.append(f"both motions in one picture: {compared.page_command}")
     return [*text, *compared.notes]
 
 
-def transitions(step: Step) -> list[str]:
+def transitions(version_change: VersionChange) -> list[str]:
     """Return the number of cases of each change as lines."""
     lines = []
-    for (change, before, after), number in step.transitions.items():
+    for (change, before, after), number in version_change.transitions.items():
         lines.append(f"{number:8d}  {before} -> {after} ({change})")
     return lines
 
 
-def _step_lines(step: Step) -> Iterator[str]:
-    if step.cases:
-        cases = counted(len(step.cases), "case")
-        yield f"from {step.before} to {step.after}: {cases} with both"
-    yield from transitions(step)
+def _version_change_lines(version_change: VersionChange) -> Iterator[str]:
+    if version_change.cases:
+        cases = counted(len(version_change.cases), "case")
+        yield f"from {version_change.number - 1} to {version_change.number}: {cases} with both"
+    yield from transitions(version_change)
     listed = (Change.BROKE, Change.WITHIN_CHANCE, Change.NOT_REPEATABLE, Change.STILL_CONTACT)
     for change in listed:
-        changed = [case for case in step.cases if case.change is change]
+        changed = [case for case in version_change.cases if case.change is change]
         if changed:
             yield f"{change}{cut(len(changed), LISTED)}:"
         for case in changed[:LISTED]:
-            yield f"  case {case.b.index}: {change_in_words(case)}"
+            yield f"  case {case.later.index}: {change_in_words(case)}"
 
 
 # Truths and samplers
@@ -531,6 +545,31 @@ def vut_check(found: VutCheck) -> list[str]:
 
 
 # Single cases
+
+
+def causes(run: RecordedCampaign, outcomes: Sequence[Outcome]) -> dict[int, str]:
+    """Return the causes of cases by index, of failures with the drivers that avoid them.
+
+    Args:
+        run: the campaign.
+        outcomes: outcomes of the cases.
+    """
+    motions = run.trajectories(outcome.index for outcome in outcomes)
+    avoidance = {one.index: _avoidance(one) for one in AVOIDANCE.read_lines(run)}
+    found = {}
+    for outcome in outcomes:
+        index = outcome.index
+        found[index] = cause(outcome, motions.get(index), avoidance.get(index, ""))
+    return found
+
+
+def _avoidance(one: Avoidance) -> str:
+    """Return the drivers that would have avoided a failure, in a clause."""
+    by = either(one.avoided_by) if one.avoided_by else "no reference driver"
+    text = f"in the place of the VUT {by} would have avoided it"
+    if one.latest_takeover_s is not None:
+        text += f", {TAKES_OVER} by taking over until {one.latest_takeover_s:.1f} s"
+    return f"{text}; so would a careful POV" if one.pov_careful else text
 
 
 def episode_lines(

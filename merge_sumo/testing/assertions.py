@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from merge_sumo import api
-from merge_sumo.analysis.counterfactuals import causes
 from merge_sumo.api import verb
 from merge_sumo.campaigns.again import again, command
 from merge_sumo.campaigns.recorded import failures
 from merge_sumo.config import NoFailures
 from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.printable import printable
+from merge_sumo.reports.text import causes
 from merge_sumo.results import CampaignRun
 from merge_sumo.scenario.case import described
 from merge_sumo.scenario.scenario import level_name

@@ -16,7 +16,7 @@ from support.handmade import write_run
 
 import merge_sumo as ms
 from merge_sumo.analysis.cases_file import CasesFile
-from merge_sumo.analysis.comparison import ComparedCase, passes
+from merge_sumo.analysis.comparison import ComparedCase
 from merge_sumo.errors import UserError
 from merge_sumo.metrics.measures import Measures
 from merge_sumo.metrics.merge import Severity
@@ -86,9 +86,9 @@ def test_a_changed_controller_is_caught_and_the_same_one_changes_nothing(file):
     assert ms.rerun(file, vut="design2?gap_m=12").worse
     edit(file, "tolerance = 0.01", "tolerance = 200.0")
     tolerant = ms.rerun(file, vut="design2?gap_m=12")
-    for one in tolerant.steps[0].cases:
+    for one in tolerant.version_changes[0].cases:
         if one.change == "worse but passing":
-            assert one.b.measures.severity == "contact", "new contacts alone"
+            assert one.later.measures.severity == "contact", "new contacts alone"
     assert len(tolerant.lines()) > 2, "what changed is shown all the same"
 
 
@@ -114,8 +114,8 @@ def test_a_controller_of_the_user_is_run_by_its_host(command_line, tmp_path, mon
 
 def test_a_new_error_or_contact_is_worse(file):
     record = CasesFile(file)
-    safe = next(o for o in record.outcomes if passes(o) and o.measures.severity == "safe")
-    fails = next(o for o in record.outcomes if not passes(o))
+    safe = next(o for o in record.outcomes if o.passes and o.measures.severity == "safe")
+    fails = next(o for o in record.outcomes if not o.passes)
 
     def change(before, **measured):
         after = replace(before, measures=Measures(**before.measures.values | measured))
@@ -228,7 +228,7 @@ def test_the_diff_has_the_lines_of_the_file_that_change(file, command_line, tmp_
 
 def test_a_failure_that_is_accepted_is_said_and_not_counted(file, command_line, tmp_path):
     now = ms.rerun(file, vut=WORSE)
-    index = next(one.b.index for one in now.steps[0].cases if one.change == "broke")
+    index = next(one.later.index for one in now.version_changes[0].cases if one.change == "broke")
     (line,) = (text for text in file.read_text().splitlines() if f"{{index = {index}," in text)
     edit(file, line, line.replace("},", ', accepted = "it waits\\u001b"},'))
     new, junit = tmp_path / "new.toml", tmp_path / "j.xml"

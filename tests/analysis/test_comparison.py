@@ -95,8 +95,8 @@ def test_shared_cases_are_paired_wherever_they_stand(tmp_path):
     a = write(tmp_path / "a", (0.1, 0.1, "passes"), (0.5, 0.5, "fails"), (0.9, 0.9, "passes"))
     b = write(tmp_path / "b", (0.5, 0.5, "passes"), (0.9, 0.9, "fails"), (0.1, 0.1, "passes"))
     found = compare([a, b])
-    (step,) = found.steps
-    assert [(c.change, c.a.index, c.b.index) for c in step.cases] == [
+    (version_change,) = found.version_changes
+    assert [(c.change, c.earlier.index, c.later.index) for c in version_change.cases] == [
         (Change.BROKE, 2, 1),
         (Change.FIXED, 1, 0),
         (Change.BOTH, 0, 2),
@@ -126,12 +126,15 @@ def test_a_version_that_passes_less_often_than_chance_explains_is_worse(call, tm
     assert not compare([a, other]).worse, "another sampler finds other shares in one version"
 
 
-def test_three_versions_are_two_steps(tmp_path):
+def test_three_versions_are_two_changes(tmp_path):
     a = write(tmp_path / "a", (0.5, 0.5, "passes"))
     b = write(tmp_path / "b", (0.5, 0.5, "fails"))
     c = write(tmp_path / "c", (0.5, 0.5, "passes"))
     found = compare([a, b, c])
-    assert [step.count(Change.BROKE) for step in found.steps] == [1, 0]
+    assert [version_change.count(Change.BROKE) for version_change in found.version_changes] == [
+        1,
+        0,
+    ]
     assert comparison_headline(found) == (
         "0 failures in 1 case -> 1 failure (0 contacts) in 1 case -> 0 failures in 1 case; from 1 "
         "to 2: of 1 shared case 1 broke; from 2 to 3: of 1 shared case 0 broke, 1 fixed"
@@ -235,13 +238,13 @@ def test_campaigns_with_repeats_are_compared_case_by_case(tmp_path):
             fail_when='end == "TIMEOUT"',
         )
         made.append(run_campaign(settings, tmp_path / f"run-{name}"))
-    (step,) = compare(made).steps
-    assert len(step.cases) == 6
-    for one in step.cases:
-        assert (one.runs_a.runs, one.runs_b.runs) == (10, 10)
+    (version_change,) = compare(made).version_changes
+    assert len(version_change.cases) == 6
+    for one in version_change.cases:
+        assert (one.earlier_runs.runs, one.later_runs.runs) == (10, 10)
         # The same seeds: what stops below .3 stops below .4, too.
-        assert one.runs_a.failures <= one.runs_b.failures
-    assert step.count(Change.BROKE) == 0, "no case is told apart by ten runs"
+        assert one.earlier_runs.failures <= one.later_runs.failures
+    assert version_change.count(Change.BROKE) == 0, "no case is told apart by ten runs"
     today = settings_of(made[0].folder, made[0].record, {"vut": made[0].vut})
     again = rerun(RunStudy(made[0], today, resolve(today)), made[0].outcomes)
-    assert {case.change for case in again.steps[0].cases} <= {Change.BOTH, Change.NEITHER}
+    assert {case.change for case in again.version_changes[0].cases} <= {Change.BOTH, Change.NEITHER}

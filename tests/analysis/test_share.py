@@ -13,7 +13,7 @@ from support.campaigning import campaign_settings, run_campaign
 from merge_sumo import api
 from merge_sumo.analysis import share
 from merge_sumo.analysis.run_study import RunStudy, end_of
-from merge_sumo.analysis.share import SHARES, LevelShare, note_shares, uniform_cases
+from merge_sumo.analysis.share import SHARES, LevelShare, uniform_cases, write_shares
 from merge_sumo.campaigns.plan import resolve
 from merge_sumo.simulation.evaluate import evaluate, simulate_part
 
@@ -110,7 +110,7 @@ def test_runs_a_fifth_of_the_cases_of_a_large_campaign(monkeypatch):
     monkeypatch.setattr(
         share, "evaluate", lambda _plan, cases, *_: [(True, True, True)] * len(cases)
     )
-    note_shares(RunStudy(run, settings, resolve(settings)))
+    write_shares(RunStudy(run, settings, resolve(settings)))
     assert SHARES.read(run.folder).levels == tuple(LevelShare(k, 240, 240) for k in (0, 1))
 
 

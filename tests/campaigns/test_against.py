@@ -64,8 +64,8 @@ class TestFinds:
     def test_most_of_a_known_difference_region(self):
         run = run_campaign(settings(cases=40), Path("run"))
         compared = compare_against(run)
-        (step,) = compared.steps
-        found = [one.b.case for one in step.cases if one.change is Change.BROKE]
+        (version_change,) = compared.version_changes
+        found = [one.later.case for one in version_change.cases if one.change is Change.BROKE]
         # Each case has the verdict of the formula, with both versions.
         assert sorted(map(str, found)) == sorted(str(o.case) for o in run.outcomes if broke(o.case))
         pool = Pool(levels=(0,), scenario=US23)

@@ -18,7 +18,6 @@ from lxml import etree
 from support.campaigning import run_campaign
 
 import merge_sumo as ms
-from merge_sumo.analysis.counterfactuals import causes
 from merge_sumo.campaigns.recorded import RecordedCampaign
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.metrics.cause import cause
@@ -26,6 +25,7 @@ from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.reports.comparison_page import comparison_page
 from merge_sumo.reports.junit import write_junit
 from merge_sumo.reports.report_model import ReportModel
+from merge_sumo.reports.text import causes
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.scenario.case import Case
 from merge_sumo.scenario.scenario import US23
