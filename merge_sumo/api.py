@@ -608,7 +608,7 @@ def run_and_report(
             stop.add_note(f"continue with: {command}")
         raise
     if junit is not None:
-        write_junit(junit, done, result.facts, result.verdict, result.gates)
+        write_junit(junit, done, result.facts, result.summary, result.gates)
     return result
 
 

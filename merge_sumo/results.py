@@ -22,8 +22,6 @@ from merge_sumo.metrics.summary import (
     MESSAGE_CHARACTERS,
     GateResult,
     Summary,
-    Verdict,
-    judge,
     parse_gates,
     shortened,
     summarise,
@@ -118,19 +116,14 @@ class CampaignRun(Result):
         return read_repeats(self.recorded)
 
     @cached_property
-    def verdict(self) -> Verdict:
-        """How many cases failed, erred or timed out; errors and timeouts by message."""
-        return judge(self.recorded.outcomes, self.recorded.tolerated)
-
-    @cached_property
     def summary(self) -> Summary:
-        """Cases, failures, regions and failure mode coverage by POV level."""
+        """Failures, errors and timeouts, and failure mode coverage by POV level."""
         return summarise(self.recorded.outcomes, self.recorded.levels, self.recorded.tolerated)
 
     @cached_property
     def facts(self) -> list[Fact]:
         """Each fact of the campaign, with the file and the key that it is from."""
-        return facts_of(self.recorded, self.summary, self.verdict)
+        return facts_of(self.recorded, self.summary)
 
     @cached_property
     def against(self) -> Comparison | None:
@@ -148,12 +141,12 @@ class CampaignRun(Result):
     def gates(self) -> list[GateResult]:
         """The gates that were given, and whether the campaign meets them."""
         regressions = len(self.regressions)
-        return [gate.check(self.verdict, self.summary, regressions) for gate in self._gates]
+        return [gate.check(self.summary, regressions) for gate in self._gates]
 
     @property
     def passed(self) -> bool:
         """Whether the VUT merged in some case, and no gate is met."""
-        return self.verdict.tested > 0 and not any(gate.met for gate in self.gates)
+        return self.summary.tested > 0 and not any(gate.met for gate in self.gates)
 
     is_good = passed
 
@@ -191,8 +184,7 @@ class CampaignRun(Result):
         shares, worst = SHARES.read(self.folder), failures(self.recorded.cases)
         criterion, at_limits = self.recorded.criterion, mostly_clipped(self.recorded.cases)
         return {
-            **to_plain(self.summary),
-            **self.verdict.to_record(),
+            **self.summary.to_record(),
             "worst_case": worst[0].index if worst else None,
             "shares": [] if shares is None else to_plain(shares.levels),
             "gates": {gate.name: gate.met for gate in self.gates},
@@ -223,7 +215,7 @@ class CampaignRun(Result):
             unrepeatable(self.repeats),
             tested,
             mostly_clipped(run.cases),
-            *self.verdict.error_lines(),
+            *self.summary.error_lines(),
             *found,
             *repeated,
             run.ran_again_in_words if run.settings.ran_again else None,
@@ -245,11 +237,11 @@ class CampaignRun(Result):
 
     def remarks(self) -> list[str]:
         """Return sentences on the gates, and one where no case could be judged."""
-        untested = [] if self.verdict.tested else [self.verdict.nothing_tested]
+        untested = [] if self.summary.tested else [self.summary.nothing_tested]
         return [*(gate.sentence for gate in self.gates), *untested]
 
     def __repr__(self) -> str:
-        return f"<campaign {self.folder}: {self.verdict.counts}>"
+        return f"<campaign {self.folder}: {self.summary.counts}>"
 
 
 class CaseRun(Result):

@@ -23,14 +23,12 @@ from merge_sumo.files import free
 from merge_sumo.metrics.merge import Severity
 from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.metrics.summary import (
-    LevelSummary,
     RunsOfCase,
+    Summary,
     by_case,
-    judge,
     one_per_case,
     summarise,
 )
-from merge_sumo.records import to_plain
 from merge_sumo.result import Result
 from merge_sumo.scenario.case import Case
 from merge_sumo.scenario.scenario import level_name
@@ -84,15 +82,16 @@ class Version:
         )
 
     @cached_property
-    def at(self) -> dict[int, LevelSummary]:
-        """The summary of each level with cases."""
-        return summarise(self.outcomes, (), self.tolerated).levels
+    def summary(self) -> Summary:
+        """The summary of its cases, and of each level with cases."""
+        levels = sorted({outcome.case.level for outcome in self.outcomes})
+        return summarise(self.outcomes, levels, self.tolerated)
 
     def to_record(self) -> dict[str, Any]:
         """Return the version as JSON has it."""
-        levels = {level_name(level): to_plain(summary) for level, summary in self.at.items()}
-        counts = judge(self.outcomes, self.tolerated).to_record()
-        return {"vut": self.vut, "folder": self.folder, **counts, "levels": levels}
+        record = self.summary.to_record()
+        levels = {level_name(level): summary for level, summary in record["levels"].items()}
+        return {"vut": self.vut, "folder": self.folder, **record, "levels": levels}
 
 
 class Change(StrEnum):
@@ -352,7 +351,7 @@ def compare(runs: Sequence[RecordedCampaign]) -> Comparison:
     for run in runs[1:]:
         _check_comparable(runs[0], run)
     versions = list(map(Version.of, runs))
-    if not versions[0].at.keys() & versions[1].at.keys():
+    if not versions[0].summary.levels.keys() & versions[1].summary.levels.keys():
         raise UserError(f"{runs[0].folder} and {runs[1].folder} have no POV level in common")
     changes = []
     for number in range(2, len(versions) + 1):
@@ -429,7 +428,7 @@ def _version_change(number: int, earlier: Version, later: Version) -> VersionCha
     for start in first.keys() & second.keys():
         cases.append(ComparedCase.of(first[start], second[start], later.tolerated))
     found = VersionChange(number, in_order(cases))
-    levels = earlier.at.keys() & later.at.keys()
+    levels = earlier.summary.levels.keys() & later.summary.levels.keys()
     earlier_cases, later_cases = _at_levels(earlier, levels), _at_levels(later, levels)
     has_own = len(cases) < max(len(earlier_cases), len(later_cases))
     if has_own and earlier.sampler == later.sampler:

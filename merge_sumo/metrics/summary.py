@@ -1,15 +1,15 @@
-"""Counts of a campaign: failures by level, cases without a verdict, and gates.
+"""Summary of a campaign: failures, errors and timeouts, coverage by POV level, and gates.
 
-A case is tested when the VUT reaches the merge point. Runs of a case with other draws are outcomes
-of their own; the case fails where more than a tolerated share of its runs fail.
+A case may run several times, with other random draws; it fails where more than a tolerated share of
+its runs fail.
 """
 
 from __future__ import annotations
 
-import math
 import re
 from collections import Counter
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from enum import StrEnum
 from functools import cache
@@ -22,16 +22,17 @@ from merge_sumo.metrics.fmc import fmc, regions
 from merge_sumo.metrics.merge import Severity
 from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.printable import counted, printable
+from merge_sumo.records import to_plain
 from merge_sumo.scenario.case import Case, to_unit
 from merge_sumo.scenario.scenario import US23, level_name
 from merge_sumo.scenario.trajectory import End
 
 CONFIDENCE = 0.95
-"""Of the interval of the failure probability of a case."""
+"""Confidence level of the interval of the failure probability of a case."""
 DOUBT = 0.05
 """Largest posterior probability of the contrary at which a failing case is decided."""
 MOST_RUNS = 20
-"""Runs of a case after which it counts as decided."""
+"""Runs after which a case counts as decided."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,28 +54,31 @@ class RunsOfCase:
 
     @property
     def failures(self) -> int:
-        """Number of runs that fail."""
+        """Number of failing runs."""
         return sum(outcome.failed for outcome in self.outcomes)
 
     @property
     def share(self) -> float:
-        """Share of the runs that fail."""
+        """Share of failing runs."""
         return self.failures / self.runs
 
     @property
     def varies(self) -> bool:
-        """Whether its runs differ in a measure: then chance is in them."""
+        """Whether the runs differ in a measure."""
         return any(outcome.measures != self.outcomes[0].measures for outcome in self.outcomes)
 
     @property
     def in_words(self) -> str:
-        """How many of the runs fail."""
+        """The failing runs in words, such as "2 of 5 runs fail"."""
         return f"{self.failures} of {counted(self.runs, 'run')} fail{'s' * (self.failures == 1)}"
 
     def deciding(self, tolerated: float = 0.0) -> Outcome:
         """Return the run that decides the case: it fails exactly where the case does.
 
         Of the runs from the worst to the best it is the first one after the tolerated ones.
+
+        Args:
+            tolerated: share of its runs in which a case may fail.
         """
         spared = 1
         while spared / self.runs <= tolerated:
@@ -87,6 +91,9 @@ def by_case(outcomes: Iterable[Outcome]) -> list[RunsOfCase]:
     """Return outcomes with a verdict by their case, in the order of the first run of each.
 
     Each outcome of draw 0 begins a case; other draws join the last case with their start.
+
+    Args:
+        outcomes: outcomes of a campaign.
     """
     cases: list[tuple[Case, list[Outcome]]] = []
     place: dict[Case, int] = {}
@@ -102,31 +109,47 @@ def by_case(outcomes: Iterable[Outcome]) -> list[RunsOfCase]:
 
 
 def failing_cases(outcomes: Iterable[Outcome], tolerated: float = 0.0) -> list[RunsOfCase]:
-    """Return the cases that fail in more than a tolerated share of their runs, as `by_case`."""
-    return [one for one in by_case(outcomes) if one.share > tolerated]
+    """Return the cases that fail in more than a tolerated share of their runs.
+
+    Args:
+        outcomes: outcomes of a campaign.
+        tolerated: share of its runs in which a case may fail.
+    """
+    return [case for case in by_case(outcomes) if case.share > tolerated]
 
 
 def one_per_case(outcomes: Iterable[Outcome], tolerated: float = 0.0) -> list[Outcome]:
-    """Return the deciding run of each case, and outcomes without a verdict as they are.
+    """Return the deciding run of each case, and each outcome without a verdict.
 
-    In the order of the first run of each case. Without repeats, these are the outcomes.
+    Args:
+        outcomes: outcomes of a campaign.
+        tolerated: share of its runs in which a case may fail.
+
+    Returns:
+        Outcomes in the order of the first run of each case; without repeats, all outcomes.
     """
-    known = list(outcomes)
-    if not any(outcome.case.draw for outcome in known):
-        return known
+    runs = list(outcomes)
+    if not any(outcome.case.draw for outcome in runs):
+        return runs
     shown: dict[int, Outcome] = {}
-    for case in by_case(known):
+    for case in by_case(runs):
         shown[case.outcomes[0].index] = case.deciding(tolerated)
-    for outcome in known:
+    for outcome in runs:
         if outcome.margin is None:
             shown[outcome.index] = outcome
     return [shown[index] for index in sorted(shown)]
 
 
 def undecided(outcomes: Iterable[Outcome], tolerated: float) -> set[int]:
-    """Return the deciding runs, by index, of failing cases with too few runs to decide.
+    """Return the failing cases with too few runs to decide.
 
-    None where cases ran more than once and no two runs of one differ: then there is no chance.
+    Args:
+        outcomes: outcomes of a campaign.
+        tolerated: share of its runs in which a case may fail.
+
+    Returns:
+        Indices of the deciding runs. Empty where cases ran more than once and no two runs of a
+        case differ: then one run decides.
     """
     cases = by_case(outcomes) if tolerated else []
     repeated = [case for case in cases if case.runs > 1]
@@ -143,7 +166,8 @@ def undecided(outcomes: Iterable[Outcome], tolerated: float) -> set[int]:
 def is_decided(failures: int, runs: int, tolerated: float) -> bool:
     """Return whether the runs of a failing case show that more than a share of all runs fail.
 
-    By the posterior of Jeffreys' prior. The first failure is left out: by it the case was noticed.
+    By the posterior of Jeffreys' prior. The first failure is left out, because the case was noticed
+    by it.
 
     Args:
         failures: number of failing runs, 1 or more.
@@ -156,7 +180,14 @@ def is_decided(failures: int, runs: int, tolerated: float) -> bool:
 
 
 def check_tolerated(tolerated: float) -> None:
-    """Raise `UserError` where a tolerated share of failing runs is not from 0 to below 1."""
+    """Check a tolerated share of failing runs.
+
+    Args:
+        tolerated: the share.
+
+    Raises:
+        UserError: it is not from 0 to below 1.
+    """
     if not 0.0 <= tolerated < 1.0:
         raise UserError(
             f"`tolerated` is {tolerated}: choose the share of its runs in which a case may fail, "
@@ -167,12 +198,15 @@ def check_tolerated(tolerated: float) -> None:
 def clopper_pearson(failures: int, cases: int, confidence: float) -> tuple[float, float]:
     """Return the exact interval of a probability by independent cases; (0, 1) without any.
 
-    Source: Clopper and Pearson (1934). Never for cases that a sampler has chosen.
+    Source: Clopper and Pearson (1934). Cases that a sampler has chosen are not independent.
 
     Args:
         failures: number of failures.
         cases: number of independent cases.
         confidence: confidence level of the interval.
+
+    Returns:
+        Lower and upper end.
     """
     from scipy.stats import binomtest
 
@@ -182,18 +216,26 @@ def clopper_pearson(failures: int, cases: int, confidence: float) -> tuple[float
     return float(found.low), float(found.high)
 
 
+MESSAGE_CHARACTERS = 300
+"""Longest message that is shown; `outcomes.jsonl` has the whole."""
+MOST_MESSAGES = 5
+"""Messages of errors and timeouts that are printed; the report has the others."""
+_VARYING = re.compile(r"0x[0-9a-fA-F]+|[-+]?\d+(?:\.\d+(?:e[-+]?\d+)?|e[-+]?\d+)")
+"""Measured values and addresses in messages."""
+
+
 @dataclass(frozen=True, slots=True)
 class LevelSummary:
-    """The findings at one POV level.
+    """The summary of one POV level.
 
     Attributes:
         cases: cases that ran.
         tested: cases in which the VUT reached the merge point.
-        failures: cases that fail under the criterion, but for those that are undecided.
-        severities: cases by severity, those that occur.
-        fmc: failure mode coverage of failing cases, undecided or not, in the level's unit cube;
-            M(s, 0.05, -500) under the paper's criterion and in up to three coordinates.
-        regions: groups of these that are linked at the radius of FMC.
+        failures: failing cases, without the undecided ones.
+        severities: number of cases by severity, for those that occur.
+        fmc: failure mode coverage of the failing cases, decided or not, in the unit cube of the
+            level; M(s, 0.05, -500) under the paper's criterion in up to three coordinates.
+        regions: groups of these cases that are linked at the radius of FMC.
         undecided: failing cases with too few runs to decide.
     """
 
@@ -207,79 +249,13 @@ class LevelSummary:
 
 
 @dataclass(frozen=True, slots=True)
-class Summary:
-    """The findings of a campaign: totals, ends and severities by name, and each level."""
-
-    cases: int
-    failures: int
-    ends: dict[str, int]
-    severities: dict[str, int]
-    levels: dict[int, LevelSummary]
-    undecided: int = 0
-
-
-def summarise(
-    outcomes: Sequence[Outcome], levels: Sequence[int], tolerated: float = 0.0
-) -> Summary:
-    """Return the summary of outcomes; a case counts once, by its deciding run.
-
-    Args:
-        outcomes: outcomes of a campaign.
-        levels: levels to report, also without cases; others are added where they have cases.
-        tolerated: share of its runs in which a case may fail.
-    """
-    unsure = undecided(outcomes, tolerated)
-    by_level: dict[int, list[Outcome]] = {level: [] for level in levels}
-    cases = one_per_case(outcomes, tolerated)
-    for outcome in cases:
-        by_level.setdefault(outcome.case.level, []).append(outcome)
-    found = {level: _level(by_level[level], level, unsure) for level in sorted(by_level)}
-    return Summary(
-        cases=len(cases),
-        failures=sum(one.failures for one in found.values()),
-        ends=_tally(End, (outcome.measures.end for outcome in cases)),
-        severities=_tally(Severity, (outcome.measures.severity for outcome in cases)),
-        levels=found,
-        undecided=len(unsure),
-    )
-
-
-def _tally(kinds: Iterable[StrEnum], values: Iterable[StrEnum | None]) -> dict[str, int]:
-    """Return the number of values of each kind that occurs, in the order of the kinds."""
-    counts = Counter(values)
-    return {kind.value: counts[kind] for kind in kinds if counts[kind]}
-
-
-def _level(outcomes: Sequence[Outcome], level: int, unsure: set[int]) -> LevelSummary:
-    points = to_unit((outcome.case for outcome in outcomes if outcome.failed), level)
-    undecided_here = len(unsure.intersection(outcome.index for outcome in outcomes))
-    return LevelSummary(
-        cases=len(outcomes),
-        tested=sum(outcome.is_tested for outcome in outcomes),
-        failures=len(points) - undecided_here,
-        severities=_tally(Severity, (outcome.measures.severity for outcome in outcomes)),
-        fmc=fmc(points),
-        regions=int(regions(points).max(initial=-1)) + 1,
-        undecided=undecided_here,
-    )
-
-
-MESSAGE_CHARACTERS = 300
-"""Of a message that is shown; `outcomes.jsonl` has the whole."""
-MOST_MESSAGES = 5
-"""Messages of errors and timeouts that are printed; the report has the others."""
-_VARYING = re.compile(r"0x[0-9a-fA-F]+|[-+]?\d+(?:\.\d+(?:e[-+]?\d+)?|e[-+]?\d+)")
-"""Measured values and addresses."""
-
-
-@dataclass(frozen=True, slots=True)
 class ErrorGroup:
-    """Cases that ended without a test, in the same way.
+    """Errors or timeouts with the same message.
 
     Attributes:
         end: VUT_ERROR, SIM_ERROR or TIMEOUT.
-        message: message of the first of them, on one line, without control characters.
-        cases: their indices, ascending.
+        message: message of the first case, on one line, without control characters.
+        cases: indices of the cases, ascending.
     """
 
     end: End
@@ -293,115 +269,168 @@ class ErrorGroup:
 
 
 @dataclass(frozen=True, slots=True)
-class Verdict:
-    """The outcome of the cases of a campaign in numbers.
+class Summary:
+    """The cases of a campaign in numbers.
 
     Attributes:
         cases: cases that ran.
-        failures: cases that fail under the criterion, but for those that are undecided.
-        undecided: failing cases with too few runs to decide.
+        failures: failing cases, without the undecided ones.
         contacts: failures in which bodies touch at or after the merge point.
         errors: cases that ended as VUT_ERROR or SIM_ERROR.
         timeouts: cases in which the VUT never reached its goal.
+        undecided_cases: deciding runs, by index, of failing cases with too few runs to decide.
         error_groups: errors and timeouts by message: errors first, then the most frequent.
         goal: place that the VUT reaches in a case that is tested.
+        ends: number of cases by end, for those that occur.
+        severities: number of cases by severity, for those that occur.
+        levels: summaries of POV levels.
+
+    Example:
+        >>> summary = summarise(run.outcomes, run.levels)
+        >>> summary.counts, summary.levels[1].fmc
+        ('12 failures (3 contacts) in 60 cases', 0.0213)
     """
 
     cases: int
     failures: int
-    undecided: int
     contacts: int
     errors: int
     timeouts: int
+    undecided_cases: frozenset[int]
     error_groups: tuple[ErrorGroup, ...]
     goal: str
+    ends: dict[str, int]
+    severities: dict[str, int]
+    levels: dict[int, LevelSummary]
+
+    @property
+    def undecided(self) -> int:
+        """Number of failing cases with too few runs to decide."""
+        return len(self.undecided_cases)
 
     @property
     def tested(self) -> int:
-        """Cases in which the VUT reached its goal."""
+        """Number of cases in which the VUT reached its goal."""
         return self.cases - self.errors - self.timeouts
 
     @property
     def nothing_tested(self) -> str:
-        """A sentence, without its full stop, on a campaign in which no case was tested."""
+        """The sentence, without its full stop, on a campaign without a tested case."""
         safely = " without an error" if self.errors else ""
         return f"nothing was tested: the VUT reached {self.goal}{safely} in no case"
 
     @property
-    def found(self) -> list[str]:
-        """The numbers in words: errors and timeouts, if there are any, then failures."""
-        return self._found("")
-
-    def _found(self, contacts: str) -> list[str]:
+    def found(self) -> str:
+        """Errors, timeouts, failures and undecided cases in words; failures also if 0."""
         parts = []
         if self.errors:
             parts.append(counted(self.errors, "error"))
         if self.timeouts:
             parts.append(counted(self.timeouts, "timeout"))
+        contacts = f" ({counted(self.contacts, 'contact')})" if self.failures else ""
         parts.append(counted(self.failures, "failure") + contacts)
         if self.undecided:
             parts.append(f"{self.undecided} undecided")
-        return parts
+        return ", ".join(parts)
 
     @property
     def counts(self) -> str:
-        """The result in a line."""
-        contacts = f" ({counted(self.contacts, 'contact')})" if self.failures else ""
-        *others, last = self._found(contacts)
-        counts = f"{', '.join(others)} and {last}" if others else last
-        return f"{counts} in {counted(self.cases, 'case')}"
+        """The line with `found` and the number of cases."""
+        return f"{self.found} in {counted(self.cases, 'case')}"
 
     def error_lines(self) -> list[str]:
-        """Return lines on errors and timeouts by message; none where there are none."""
+        """Return the lines on the most frequent errors and timeouts."""
         lines = []
-        for one in self.error_groups[:MOST_MESSAGES]:
-            first = f"the first in case {one.cases[0]}: {one.message}"
-            lines.append(f"  {one.count} {one.end}, {first}")
+        for group in self.error_groups[:MOST_MESSAGES]:
+            first = f"the first in case {group.cases[0]}: {group.message}"
+            lines.append(f"  {group.count} {group.end}, {first}")
         others = self.error_groups[MOST_MESSAGES:]
         if others:
-            number = sum(one.count for one in others)
+            number = sum(group.count for group in others)
             lines.append(f"  {number} with {len(others)} other messages")
         return lines
 
     def to_record(self) -> dict[str, Any]:
-        """Return contacts, errors and timeouts as JSON has them."""
-        error_groups = []
-        for one in self.error_groups:
-            example = {"end": one.end, "message": one.message, "cases": one.count}
-            error_groups.append(example | {"example": one.cases[0]})
-        counts = {"contacts": self.contacts, "errors": self.errors, "timeouts": self.timeouts}
-        return counts | {"error_groups": error_groups}
+        """Return the summary as JSON has it: counts, levels, and an example of each error."""
+        record: dict[str, Any] = to_plain(self)
+        del record["undecided_cases"], record["goal"]
+        for group in record["error_groups"]:
+            group["example"] = group["cases"][0]
+            group["cases"] = len(group["cases"])
+        return record | {"undecided": self.undecided}
 
 
-def judge(outcomes: Sequence[Outcome], tolerated: float = 0.0) -> Verdict:
-    """Return the verdict on outcomes; a case counts once, as in `summarise`."""
+def summarise(
+    outcomes: Sequence[Outcome], levels: Iterable[int] = (), tolerated: float = 0.0
+) -> Summary:
+    """Return the summary of outcomes; a case counts once, by its deciding run.
+
+    Args:
+        outcomes: outcomes of a campaign.
+        levels: POV levels with a summary of their own, which takes the time of FMC.
+        tolerated: share of its runs in which a case may fail.
+    """
     cases, unsure = one_per_case(outcomes, tolerated), undecided(outcomes, tolerated)
-    groups: dict[tuple[End, str], list[Outcome]] = {}
-    failures = contacts = errors = timeouts = 0
-    for outcome in cases:
-        end = outcome.measures.end
-        if outcome.failed and outcome.index not in unsure:
-            failures += 1
-            contacts += outcome.measures.severity == Severity.CONTACT
-        if not outcome.is_tested:
-            errors += end.is_error
-            timeouts += not end.is_error
-            # Messages that differ in numbers and addresses alone are one.
-            pattern = _VARYING.sub("#", message_of(outcome))
-            groups.setdefault((end, pattern), []).append(outcome)
-    error_groups = []
-    for (end, _), same in groups.items():
-        indices = tuple(outcome.index for outcome in same)
-        error_groups.append(ErrorGroup(end, message_of(same[0]), indices))
-    error_groups.sort(key=lambda one: (not one.end.is_error, -one.count, one.cases[0]))
-    goal = cases[0].case.scenario.goal if cases else US23.goal
-    return Verdict(
-        len(cases), failures, len(unsure), contacts, errors, timeouts, tuple(error_groups), goal
+    failed = [case for case in cases if case.failed and case.index not in unsure]
+    untested = [case for case in cases if not case.is_tested]
+    errors = sum(case.measures.end.is_error for case in untested)
+    return Summary(
+        cases=len(cases),
+        failures=len(failed),
+        contacts=sum(case.measures.severity == Severity.CONTACT for case in failed),
+        errors=errors,
+        timeouts=len(untested) - errors,
+        undecided_cases=frozenset(unsure),
+        error_groups=_error_groups(untested),
+        goal=cases[0].case.scenario.goal if cases else US23.goal,
+        ends=_tally(End, (case.measures.end for case in cases)),
+        severities=_tally(Severity, (case.measures.severity for case in cases)),
+        levels={level: _of_level(cases, level, unsure) for level in levels},
     )
 
 
+def _tally(kinds: Iterable[StrEnum], values: Iterable[StrEnum | None]) -> dict[str, int]:
+    """Return the number of values of each kind that occurs, in the order of the kinds."""
+    counts = Counter(values)
+    return {kind.value: counts[kind] for kind in kinds if counts[kind]}
+
+
+def _of_level(cases: Iterable[Outcome], level: int, unsure: set[int]) -> LevelSummary:
+    at_level = [case for case in cases if case.case.level == level]
+    failed = [case for case in at_level if case.failed]
+    points = to_unit((case.case for case in failed), level)
+    undecided_cases = sum(case.index in unsure for case in failed)
+    return LevelSummary(
+        cases=len(at_level),
+        tested=sum(case.is_tested for case in at_level),
+        failures=len(failed) - undecided_cases,
+        severities=_tally(Severity, (case.measures.severity for case in at_level)),
+        fmc=fmc(points),
+        regions=int(regions(points).max(initial=-1)) + 1,
+        undecided=undecided_cases,
+    )
+
+
+def _error_groups(untested: Iterable[Outcome]) -> tuple[ErrorGroup, ...]:
+    """Return cases by end and message; messages that differ in numbers or addresses are one."""
+    groups: dict[tuple[End, str], list[Outcome]] = {}
+    for outcome in untested:
+        pattern = _VARYING.sub("#", message_of(outcome))
+        groups.setdefault((outcome.measures.end, pattern), []).append(outcome)
+    found = []
+    for (end, _), same in groups.items():
+        indices = tuple(outcome.index for outcome in same)
+        found.append(ErrorGroup(end, message_of(same[0]), indices))
+    found.sort(key=lambda group: (not group.end.is_error, -group.count, group.cases[0]))
+    return tuple(found)
+
+
 def message_of(outcome: Outcome) -> str:
-    """Return why a case, or its follow-up, has no end, on one line that may be shown anywhere."""
+    """Return the reason of an error or a timeout, on one line that may be shown anywhere.
+
+    Args:
+        outcome: a case that was not tested, or has an error in its follow-up.
+    """
     measures = outcome.measures
     if measures.error is not None:
         # Cut before it is escaped: a message may have megabytes.
@@ -412,7 +441,12 @@ def message_of(outcome: Outcome) -> str:
 
 
 def shortened(text: str, characters: int) -> str:
-    """Return a text, or its beginning where it is longer."""
+    """Return a text, or its beginning where it is longer.
+
+    Args:
+        text: the text.
+        characters: maximum length of the result.
+    """
     return text if len(text) <= characters else text[: characters - 3] + "..."
 
 
@@ -420,52 +454,18 @@ REGRESSIONS = "regressions"
 """The gate that counts the cases that fail and pass with an earlier version of the VUT."""
 NUMBERS = ("failures", "errors", "timeouts", REGRESSIONS)
 """Gates that are met by one case."""
-
-
-@dataclass(frozen=True, slots=True)
-class Gate:
-    """A bound that a campaign must not exceed.
-
-    Attributes:
-        what: one of `NUMBERS`, or "fmc", the coverage at some POV level.
-        above: the gate is met beyond this.
-    """
-
-    what: str
-    above: float = 0.0
-
-    @property
-    def name(self) -> str:
-        """The gate as it is written."""
-        return f"{self.what}>{self.above}" if self.what == "fmc" else self.what
-
-    def check(self, verdict: Verdict, summary: Summary, regressions: int = 0) -> GateResult:
-        """Return whether a campaign meets the gate, and the number that decides.
-
-        Args:
-            verdict: verdict on the campaign.
-            summary: summary of the campaign.
-            regressions: number of cases that fail now and pass with the earlier version.
-        """
-        if self.what == "fmc":
-            most, level = 0.0, min(summary.levels, default=0)
-            for one, found in summary.levels.items():
-                if found.fmc > most:
-                    most, level = found.fmc, one
-            text = f"FMC {most:.4f} at level {level_name(level)}"
-            return GateResult(self.name, most > self.above, text)
-        number = regressions if self.what == REGRESSIONS else getattr(verdict, self.what)
-        text = counted(number, self.what.removesuffix("s"))
-        if self.what == "failures" and verdict.undecided:
-            # One that is undecided may be a failure.
-            number += verdict.undecided
-            text += f" and {verdict.undecided} undecided"
-        return GateResult(self.name, number > 0, text)
+_COVERAGE = re.compile(r"fmc\s*>\s*(.*)")
 
 
 @dataclass(frozen=True, slots=True)
 class GateResult:
-    """The result of a gate: whether a campaign meets it, and the number found."""
+    """The result of a gate.
+
+    Attributes:
+        name: the gate as a user writes it.
+        met: whether the campaign meets it, and so does not pass.
+        found: the number that decides, in words.
+    """
 
     name: str
     met: bool
@@ -477,34 +477,77 @@ class GateResult:
         return f"gate {self.name}: {'met' if self.met else 'not met'} ({self.found})"
 
 
+@dataclass(frozen=True, slots=True)
+class Gate:
+    """A bound that a campaign must not exceed.
+
+    Attributes:
+        what: one of `NUMBERS`, or "fmc", the largest coverage at a POV level.
+        above: the gate is met beyond this value.
+
+    Example:
+        >>> Gate("fmc", 0.05).check(summary).sentence
+        'gate fmc>0.05: met (FMC 0.0712 at level 1)'
+    """
+
+    what: str
+    above: float = 0.0
+
+    @property
+    def name(self) -> str:
+        """The gate as a user writes it."""
+        return f"{self.what}>{self.above}" if self.what == "fmc" else self.what
+
+    def check(self, summary: Summary, regressions: int = 0) -> GateResult:
+        """Return the result of the gate; undecided cases count as failures.
+
+        Args:
+            summary: summary of the campaign, with its levels.
+            regressions: number of cases that fail now and pass with the earlier version.
+        """
+        if self.what == "fmc":
+            level = max(summary.levels, key=lambda level: summary.levels[level].fmc)
+            most = summary.levels[level].fmc
+            text = f"FMC {most:.4f} at level {level_name(level)}"
+            return GateResult(self.name, most > self.above, text)
+        number = regressions if self.what == REGRESSIONS else getattr(summary, self.what)
+        text = counted(number, self.what.removesuffix("s"))
+        if self.what == "failures" and summary.undecided:
+            number += summary.undecided
+            text += f" and {summary.undecided} undecided"
+        return GateResult(self.name, number > 0, text)
+
+
 def parse_gates(texts: Iterable[str], *, against: bool = False) -> list[Gate]:
-    """Return gates by their names, each once; `UserError` for a text that names none.
+    """Return gates by their texts, each once.
 
     Args:
-        texts: names of gates, such as "errors" or "fmc>0.1".
+        texts: gates as a user writes them, such as "errors" or "fmc>0.1".
         against: whether the campaign is against an earlier version of the VUT.
+
+    Raises:
+        UserError: a text is not a gate, or its gate needs an earlier version.
     """
     gates: dict[str, Gate] = {}
     for text in texts:
-        what, _, number = (part.strip() for part in text.partition(">"))
-        if text not in NUMBERS and (what != "fmc" or ">" not in text):
-            raise UserError(
-                f"there is no gate {printable(text)!r}: choose {', '.join(NUMBERS)} or "
-                '"fmc>X" (in quotes, or the shell takes the ">")'
-            )
-        if text == REGRESSIONS and not against:
+        gate = _parsed_gate(text)
+        if gate.what == REGRESSIONS and not against:
             raise UserError(
                 f"the gate {text} needs an earlier version of the VUT: name it with `against`"
             )
-        try:
-            above = 0.0 if text in NUMBERS else float(number)
-        except ValueError:
-            above = math.nan
-        if not 0.0 <= above < 1.0:
-            raise UserError(
-                f'the gate {printable(text)!r} cannot be decided: X of "fmc>X" is a number from '
-                "0 to below 1"
-            )
-        gate = Gate(what, above)
         gates[gate.name] = gate
     return list(gates.values())
+
+
+def _parsed_gate(text: str) -> Gate:
+    if text in NUMBERS:
+        return Gate(text)
+    if bound := _COVERAGE.fullmatch(text.strip()):
+        with suppress(ValueError):
+            above = float(bound[1])
+            if 0.0 <= above < 1.0:
+                return Gate("fmc", above)
+    raise UserError(
+        f'there is no gate {printable(text)!r}: choose {", ".join(NUMBERS)} or "fmc>X" with X '
+        'from 0 to below 1 (in quotes, or the shell takes the ">")'
+    )

@@ -28,7 +28,7 @@ from merge_sumo.metrics.cause import cause
 from merge_sumo.metrics.criterion import condition_of
 from merge_sumo.metrics.fmc import radius_for
 from merge_sumo.metrics.outcome import Outcome
-from merge_sumo.metrics.summary import judge, one_per_case
+from merge_sumo.metrics.summary import one_per_case
 from merge_sumo.printable import printable
 from merge_sumo.records import check_toml_size, toml_value
 from merge_sumo.road.scenario_file import SUFFIX
@@ -70,7 +70,7 @@ def with_file(compared: Comparison, file: CasesFile, path: Path) -> Comparison:
             result = "passes now: take the mark away" if one.later.passes else "fails, not counted"
             notes.append(f"case {index} is accepted ({reason}) and {result}")
     if not any(one.is_tested for one in now.outcomes):
-        notes.append(judge(now.outcomes).nothing_tested)
+        notes.append(now.summary.nothing_tested)
     notes += compared.notes
     return replace(compared, text=text, notes=tuple(map(printable, notes)))
 

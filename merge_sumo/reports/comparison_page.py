@@ -11,7 +11,6 @@ from merge_sumo.analysis.comparison import Change, Comparison, VersionChange, co
 from merge_sumo.campaigns.recorded import AGAINST, RecordedCampaign
 from merge_sumo.files import GENERATOR, replace_own
 from merge_sumo.metrics.cause import cause
-from merge_sumo.metrics.summary import judge
 from merge_sumo.reports.pages import X_AXIS, page
 from merge_sumo.reports.text import change_in_words, comparison_headline, fmc_rows
 from merge_sumo.scenario.case import FloatArray, coordinates
@@ -53,7 +52,6 @@ def comparison_page(compared: Comparison) -> str:
         styles=STYLES,
         compared=compared,
         headline=comparison_headline(compared),
-        counts=[judge(one.outcomes, one.tolerated).counts for one in compared.versions],
         fmc=fmc_rows(compared),
         change_in_words=change_in_words,
         version_changes=rows,

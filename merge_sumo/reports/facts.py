@@ -28,7 +28,7 @@ from merge_sumo.metrics.cause import heading
 from merge_sumo.metrics.fmc import radius_for
 from merge_sumo.metrics.merge import Severity
 from merge_sumo.metrics.outcome import Outcome
-from merge_sumo.metrics.summary import LevelSummary, Summary, Verdict, by_case, undecided
+from merge_sumo.metrics.summary import LevelSummary, Summary, by_case
 from merge_sumo.printable import printable
 
 PERCENT = "%"
@@ -88,25 +88,23 @@ class Fact:
 Facts = Iterator[Fact]
 
 
-def facts_of(run: RecordedCampaign, summary: Summary, verdict: Verdict) -> list[Fact]:
+def facts_of(run: RecordedCampaign, summary: Summary) -> list[Fact]:
     """Return the facts of a campaign and of the studies in its folder.
 
     Args:
         run: the campaign.
         summary: its summary.
-        verdict: its verdict.
 
     Raises:
         UserError: a file of a study is damaged.
     """
     failing = run.criterion.condition if run.criterion.is_papers else "margin < 0"
-    unsure = undecided(run.outcomes, run.tolerated)
-    facts = [*_settings(run), *_shares(run), *_counts(run, summary, verdict, failing)]
+    facts = [*_settings(run), *_shares(run), *_counts(run, summary, failing)]
     for level, found in summary.levels.items():
         facts += _of_level(run, level, found, failing)
     facts += _repeats(run)
-    facts += _motion(run, unsure, failing)
-    facts += _avoided(run, unsure)
+    facts += _motion(run, summary.undecided_cases, failing)
+    facts += _avoided(run, summary.undecided_cases)
     facts += _studies(run)
     return facts
 
@@ -144,19 +142,19 @@ def _shares(run: RecordedCampaign) -> Facts:
                 yield fact(name, one.without_verdict, "levels: without_verdict")
 
 
-def _counts(run: RecordedCampaign, summary: Summary, verdict: Verdict, failing: str) -> Facts:
+def _counts(run: RecordedCampaign, summary: Summary, failing: str) -> Facts:
     yield Fact("cases", summary.cases, "lines")
     if run.converged:
         yield Fact(AT_MOST, run.settings.cases, "cases", file=SETTINGS)
-    if verdict.errors:
-        yield Fact("errors", verdict.errors, "end: VUT_ERROR, SIM_ERROR")
-    if verdict.timeouts:
-        yield Fact("timeouts", verdict.timeouts, "end: TIMEOUT")
+    if summary.errors:
+        yield Fact("errors", summary.errors, "end: VUT_ERROR, SIM_ERROR")
+    if summary.timeouts:
+        yield Fact("timeouts", summary.timeouts, "end: TIMEOUT")
     yield Fact("failures", summary.failures, failing)
     if run.tolerated:
         yield Fact(UNDECIDED, summary.undecided, "draw")
     if summary.failures:
-        yield Fact("failures with contact", verdict.contacts, f"{failing}, severity: contact")
+        yield Fact("failures with contact", summary.contacts, f"{failing}, severity: contact")
     passing = Counter(one.measures.severity for one in run.cases if not one.failed)
     for severity, name in (
         (Severity.CONTACT, CONTACT),
@@ -220,7 +218,7 @@ def _repeats(run: RecordedCampaign) -> Facts:
         yield Fact(name, 100.0 * run.tolerated, "tolerated", PERCENT, SETTINGS)
 
 
-def _motion(run: RecordedCampaign, unsure: set[int], failing: str) -> Facts:
+def _motion(run: RecordedCampaign, undecided: frozenset[int], failing: str) -> Facts:
     key = f"t_end_s; the follow-up by {TRAJECTORIES}/"
     yield Fact("simulated time", run.simulated_s / 3600.0, key, "h")
     failed = failures(run.cases)
@@ -230,7 +228,7 @@ def _motion(run: RecordedCampaign, unsure: set[int], failing: str) -> Facts:
     yield Fact(WORST, worst.index, "lowest margin")
     kind = heading(worst, run.trajectories([worst.index]).get(worst.index))
     yield Fact(KIND, kind, "severity, impact_speed_mps; by its motion")
-    decided = [outcome for outcome in failed if outcome.index not in unsure]
+    decided = [outcome for outcome in failed if outcome.index not in undecided]
     if avoidable := _values(decided, "avoidable"):
         name = "failures that full braking or full acceleration of the VUT avoids"
         yield Fact(name, sum(avoidable), f"{failing}, avoidable")
@@ -242,12 +240,12 @@ def _motion(run: RecordedCampaign, unsure: set[int], failing: str) -> Facts:
             yield Fact(name, max(values), f"{failing}: {key}", unit)
 
 
-def _avoided(run: RecordedCampaign, unsure: set[int]) -> Facts:
-    known = [one for one in AVOIDANCE.read_lines(run) if one.index not in unsure]
+def _avoided(run: RecordedCampaign, undecided: frozenset[int]) -> Facts:
+    known = [one for one in AVOIDANCE.read_lines(run) if one.index not in undecided]
     if not known:
         return
     fact = partial(Fact, file=AVOIDANCE.name)
-    if len(known) < sum(outcome.failed for outcome in run.cases) - len(unsure):
+    if len(known) < sum(outcome.failed for outcome in run.cases) - len(undecided):
         yield fact(DRIVEN, len(known), "lines")
     for name in REFERENCES:
         number = sum(name in one.avoided_by for one in known)

@@ -16,7 +16,7 @@ from merge_sumo.analysis.comparison import (
 from merge_sumo.campaigns.recorded import NAME_CHARACTERS, RecordedCampaign
 from merge_sumo.errors import UserError
 from merge_sumo.files import check_new, write_new
-from merge_sumo.metrics.summary import GateResult, Verdict, by_case, undecided
+from merge_sumo.metrics.summary import GateResult, Summary, by_case
 from merge_sumo.printable import printable
 from merge_sumo.reports.facts import Fact, by_level
 from merge_sumo.reports.pages import environment
@@ -62,7 +62,7 @@ def write_junit(
     path: Path,
     run: RecordedCampaign,
     facts: Sequence[Fact],
-    verdict: Verdict,
+    summary: Summary,
     gates: Sequence[GateResult],
 ) -> None:
     """Write the JUnit file of a campaign.
@@ -75,16 +75,16 @@ def write_junit(
         path: new file to write.
         run: the campaign.
         facts: its facts.
-        verdict: its verdict.
+        summary: its summary.
         gates: results of its gates.
 
     Raises:
         UserError: the file exists or cannot be written.
     """
-    tested = TestCase(f"the VUT reaches {verdict.goal}", "gates")
-    if not verdict.tested:
+    tested = TestCase(f"the VUT reaches {summary.goal}", "gates")
+    if not summary.tested:
         tested.tag, tested.kind = "failure", "NOTHING_TESTED"
-        tested.message = verdict.nothing_tested
+        tested.message = summary.nothing_tested
     suites = {"gates": [tested]}
     for gate in gates:
         test = TestCase(gate.name, "gates", kind="GATE", message=gate.sentence)
@@ -96,7 +96,7 @@ def write_junit(
         suites[f"against {earlier}"] = _tests(compared.version_changes[0])
     for level in by_level(facts):
         suites[f"POV level {level_name(level)}"] = []
-    for test in _cases(run):
+    for test in _cases(run, summary.undecided_cases):
         suites[f"POV {test.group}"].append(test)
     _write(path, f"merge-sumo {run.vut}", suites, facts)
 
@@ -119,19 +119,18 @@ def _write(
     write_new(path, text.strip().encode(), "`junit`")
 
 
-def _cases(run: RecordedCampaign) -> list[TestCase]:
+def _cases(run: RecordedCampaign, undecided: frozenset[int]) -> list[TestCase]:
     runs = {}
     for case in by_case(run.outcomes):
         if case.runs > 1:
             runs[case.deciding(run.tolerated).index] = f", {case.in_words}"
-    unsure = undecided(run.outcomes, run.tolerated)
     cause_of = causes(run, [one for one in run.cases if one.failed or not one.is_tested])
     tests = []
     for outcome in run.cases:
         index, measures = outcome.index, outcome.measures
         name = f"case {index}: {described(outcome.case)}{runs.get(index, '')}"
         test = TestCase(name, f"level {level_name(outcome.case.level)}", measures.t_end_s)
-        if index in unsure:
+        if index in undecided:
             test.tag, test.message = "skipped", f"undecided: {cause_of[index]}"
         elif index in cause_of:
             test.tag = "error" if measures.end.is_error else "failure"

@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn
 
 from merge_sumo.metrics.outcome import Outcome
-from merge_sumo.metrics.summary import judge
+from merge_sumo.metrics.summary import summarise
 from merge_sumo.printable import counted, printable
 from merge_sumo.reports.report import REPORT
 
@@ -192,4 +192,4 @@ class CampaignBars(Bars):
         self.counted("cases", len(self._outcomes), self._cases, "cases", self._found)
 
     def _found(self) -> str:
-        return ", ".join(judge(self._outcomes, self._tolerated).found)
+        return summarise(self._outcomes, tolerated=self._tolerated).found

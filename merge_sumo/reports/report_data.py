@@ -123,8 +123,8 @@ def _row(model: ReportModel, outcome: Outcome) -> dict[str, Any]:
             each = [(run.index, run.failed) for run in runs.outcomes]
             row["runs"] = {"failed": runs.failures, "number": runs.runs, "each": each}
             row["runs"] |= {"low": low, "high": high}
-    if model.undecided:
-        row["undecided"] = index in model.undecided
+    if model.summary.undecided:
+        row["undecided"] = index in model.summary.undecided_cases
     return row
 
 

@@ -15,7 +15,7 @@ from merge_sumo.campaigns.recorded import RecordedCampaign, failures, regions_of
 from merge_sumo.errors import UserError
 from merge_sumo.metrics.cause import Diagnosis, FailureBox, Kind, diagnose, failure_boxes
 from merge_sumo.metrics.outcome import Outcome
-from merge_sumo.metrics.summary import ErrorGroup, by_case, judge, summarise, undecided
+from merge_sumo.metrics.summary import ErrorGroup, by_case, summarise
 from merge_sumo.reports.facts import facts_of
 from merge_sumo.road.loader import road_for, road_of
 from merge_sumo.scenario.case import coordinates
@@ -40,8 +40,6 @@ class ReportModel:
         repeated: by its index, all runs of a case that ran more than once.
         varies: whether runs of a case differ.
         summary: summary of the campaign.
-        verdict: verdict on the campaign.
-        undecided: failing cases with too few runs to decide, by the index of the deciding run.
         facts: facts of the campaign.
         levels: POV levels.
         surfaces: surrogate of each level; None where there is none.
@@ -65,7 +63,7 @@ class ReportModel:
 
     Example:
         >>> model = ReportModel(ms.open_run("runs/latest").run, learns=False)
-        >>> model.worst[0].index, model.verdict.counts
+        >>> model.worst[0].index, model.summary.counts
     """
 
     def __init__(self, run: RecordedCampaign, *, learns: bool = True) -> None:
@@ -86,9 +84,7 @@ class ReportModel:
         self.repeated = {case.deciding(run.tolerated).index: case for case in runs}
         self.varies = any(case.varies for case in runs)
         self.summary = summarise(run.outcomes, run.levels, run.tolerated)
-        self.verdict = judge(run.outcomes, run.tolerated)
-        self.undecided = undecided(run.outcomes, run.tolerated)
-        self.facts = facts_of(run, self.summary, self.verdict)
+        self.facts = facts_of(run, self.summary)
         self.levels = list(self.summary.levels)
         self.surfaces: dict[int, Surface | None] = dict.fromkeys(self.levels)
         if learns:
@@ -140,9 +136,9 @@ class ReportModel:
         self.near = sorted(passing, key=lambda outcome: (outcome.margin, outcome.index))
         self.error_groups: list[tuple[ErrorGroup, list[Outcome]]] = []
         first: list[Outcome] = []
-        for trouble in self.verdict.error_groups[:LISTED]:
-            examples = [self.run.outcome(index) for index in trouble.cases[:LISTED]]
-            self.error_groups.append((trouble, examples))
+        for group in self.summary.error_groups[:LISTED]:
+            examples = [self.run.outcome(index) for index in group.cases[:LISTED]]
+            self.error_groups.append((group, examples))
             first += examples
         first += self.spread + self.near[:LISTED] + self.worst + untested + self.near
         by_index = {outcome.index: outcome for outcome in first}

@@ -37,7 +37,6 @@ from merge_sumo.metrics.measures import measures_in
 from merge_sumo.metrics.merge import Conflict
 from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.metrics.plausibility import late_errors
-from merge_sumo.metrics.summary import judge
 from merge_sumo.printable import counted, either, printable
 from merge_sumo.reports.facts import (
     AT_MOST,
@@ -187,7 +186,7 @@ def version_change_headline(version_change: VersionChange) -> str:
 
 def comparison_headline(compared: Comparison) -> str:
     """Return the failures of each version, and how much broke and was fixed, in a sentence."""
-    parts = [" -> ".join(judge(one.outcomes, one.tolerated).counts for one in compared.versions)]
+    parts = [" -> ".join(version.summary.counts for version in compared.versions)]
     for version_change in compared.version_changes:
         between = (
             f"from {version_change.number - 1} to {version_change.number}: "
@@ -201,12 +200,12 @@ def comparison_headline(compared: Comparison) -> str:
 def fmc_rows(compared: Comparison) -> dict[int, list[str]]:
     """Return by level the FMC of each version as text, of its own cases; "-" for none."""
     rows: dict[int, list[str]] = {}
-    for level in sorted({level for version in compared.versions for level in version.at}):
-        rows[level] = []
-        for version in compared.versions:
-            found = version.at.get(level)
-            rows[level].append(f"{found.fmc:.4f}" if found and found.tested else "-")
-    return rows
+    for number, version in enumerate(compared.versions):
+        for level, summary in version.summary.levels.items():
+            row = rows.setdefault(level, ["-"] * len(compared.versions))
+            if summary.tested:
+                row[number] = f"{summary.fmc:.4f}"
+    return dict(sorted(rows.items()))
 
 
 @lines_of.register
@@ -217,9 +216,9 @@ def comparison(compared: Comparison) -> list[str]:
         return [*text, *compared.notes]
     text.append(compared.source)
     for number, version in enumerate(compared.versions, start=1):
-        verdict = judge(version.outcomes, version.tolerated)
-        text.append(f"{number}: {version.folder or 'now'} ({version.vut}): {verdict.counts}")
-        text += verdict.error_lines()
+        summary = version.summary
+        text.append(f"{number}: {version.folder or 'now'} ({version.vut}): {summary.counts}")
+        text += summary.error_lines()
         for late in late_errors(version.outcomes):
             text.append(f"  {late}")
     for level, row in fmc_rows(compared).items():

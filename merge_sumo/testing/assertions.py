@@ -31,13 +31,13 @@ def _message(run: CampaignRun, seed: int) -> str | None:
     outcomes = run.recorded.cases
     failed = failures(outcomes)
     wrong = [*failed, *(outcome for outcome in outcomes if outcome.measures.end.is_error)]
-    if run.verdict.tested and not wrong:
+    if run.summary.tested and not wrong:
         return None
-    lines = [f"{run.recorded.vut}: {run.verdict.counts}, with seed {seed}"]
+    lines = [f"{run.recorded.vut}: {run.summary.counts}, with seed {seed}"]
     lines.append(f"  a case fails when {run.recorded.criterion.description(run.recorded.scenario)}")
-    lines += run.verdict.error_lines()
-    if not run.verdict.tested:
-        lines.append(f"  {run.verdict.nothing_tested}")
+    lines += run.summary.error_lines()
+    if not run.summary.tested:
+        lines.append(f"  {run.summary.nothing_tested}")
     if wrong:
         lines += _worst(run, wrong[0], "worst case" if failed else "first error")
     return "\n".join(map(printable, [*lines, f"  report: {run.report_file}"]))

@@ -33,10 +33,9 @@ def test_counts_cases_and_not_runs(tmp_path):
     run_campaign(campaign_settings(vut=vut, tolerated=0.3, **known), tmp_path / "run")
     opened = api.CampaignRun(tmp_path / "run", gates=["failures"])
     failing = failing_cases(opened.recorded.outcomes, 0.3)
-    assert opened.summary.failures == opened.verdict.failures
-    assert opened.summary.undecided == opened.verdict.undecided > 0
+    assert opened.summary.undecided > 0
     assert opened.summary.failures + opened.summary.undecided == len(failing)
-    assert opened.verdict.cases == len(by_case(opened.recorded.outcomes)) == 20
+    assert opened.summary.cases == len(by_case(opened.recorded.outcomes)) == 20
     facts = {fact.name: fact.value for fact in opened.facts}
     assert facts["runs"] == 60
     assert facts["share of its runs in which a case may fail"] == 30.0

@@ -246,7 +246,7 @@ class TestTheCause:
         assert ms.replay(run.folder, index).lines()[1] == said
         assert ms.explain(run.folder, index).lines()[1].strip() == said
         opened = ms.open_run(run.folder)
-        write_junit(tmp_path / "junit.xml", run, opened.facts, opened.verdict, [])
+        write_junit(tmp_path / "junit.xml", run, opened.facts, opened.summary, [])
         assert said in [one.text for one in etree.parse(tmp_path / "junit.xml").iter("failure")]
         compared = ms.compare([run.folder, run.folder])
         without = cause(outcome, run.trajectory(index))
