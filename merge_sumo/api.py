@@ -43,20 +43,20 @@ from merge_sumo.analysis import probability as estimates
 from merge_sumo.analysis import rerun as rerunning
 from merge_sumo.analysis import stress as ladder
 from merge_sumo.analysis.truth import TruthResult
-from merge_sumo.campaigns.again import again
+from merge_sumo.campaign_run import CampaignRun, CaseRun, campaign_of, folder_of, open_recorded
 from merge_sumo.campaigns.campaign import SCENARIOS, case_name, run_campaign
-from merge_sumo.campaigns.plan import (
-    changed_scenario,
-    explicit,
+from merge_sumo.campaigns.from_config import (
+    named_settings,
     planned_case,
-    resolve,
-    settings_for,
+    scenario_from,
+    settings_from_config,
 )
+from merge_sumo.campaigns.printed_commands import campaign_command
 from merge_sumo.campaigns.recorded import SETTINGS, RecordedCampaign, read_settings
 from merge_sumo.campaigns.scenario_suggestion import unseen
-from merge_sumo.campaigns.settings import CampaignSettings, settings_of
+from merge_sumo.campaigns.settings import CampaignSettings, settings_from_folder
 from merge_sumo.controllers.controller import Car, Seen
-from merge_sumo.controllers.in_memory import AnyVut, drivers_of, is_in_process
+from merge_sumo.controllers.in_memory import AnyVut, is_in_process, spec_of_driver
 from merge_sumo.controllers.parameters import Range
 from merge_sumo.controllers.python import SeenBatch
 from merge_sumo.drivers.policies import policies_in
@@ -83,7 +83,6 @@ from merge_sumo.reports.junit import JUNIT, check_junit, write_junit, write_juni
 from merge_sumo.reports.progress import Bars, CampaignBars, Counter
 from merge_sumo.reports.report import RunningReport, check_report, write_report
 from merge_sumo.result import Shown
-from merge_sumo.results import CampaignRun, CaseRun, campaign_of, folder_of, recorded
 from merge_sumo.road.scenario_file import SUFFIX, spoken_name
 from merge_sumo.scenario.case import outside_of_the_pool
 from merge_sumo.scenario.scenario import (
@@ -99,15 +98,12 @@ from merge_sumo.sumo import replay as replayer
 from merge_sumo.sumo.binding import scratch_folder
 from merge_sumo.sumo.replay import Replay, check_display
 from merge_sumo.sumo.replay_folder import CONFIG, write_scenario
-from merge_sumo.workers import AnyWorkers, open_workers
+from merge_sumo.workers import open_workers
 
 if TYPE_CHECKING:
     from merge_sumo.training.helix import PolicyChecks
 
 __all__ = ["AnyVut", "CampaignRun", "Car", "CaseRun", "Seen", "SeenBatch", "dated"]
-
-FEW_CASES = 1000
-"""Cases of built-in drivers that one process runs before others have started and share them."""
 
 P = ParamSpec("P")
 C = TypeVar("C")
@@ -164,28 +160,27 @@ def _docstrings() -> dict[tuple[str, str], str]:
 @verb(c.Campaign)
 def campaign(config: c.Campaign) -> CampaignRun:
     """Test a VUT and return the campaign, also one without failures."""
-    settings, where = settings_for(config)
+    settings = settings_from_config(config)
     folder = dated(settings.vut) if config.out is None else Path(config.out)
-    plan = resolve(settings)
+    plan = settings.load_plan()
     notice_povs(settings, plan, config)
     check_new(folder)
-    return run_and_report(settings, plan, folder, where, config)
+    return run_and_report(settings, plan, folder, config)
 
 
 @verb(c.Resume)
 def resume(config: c.Resume) -> CampaignRun:
     """Continue a campaign that was stopped."""
     folder = folder_of(config.run)
-    recorded = read_settings(folder)
-    fields, where = explicit(config, recorded.get("vut") or "", recorded.get("pov"))
-    settings = settings_of(folder, recorded, fields, resumes=True)
+    named = named_settings(config)
+    settings = settings_from_folder(folder, read_settings(folder), named, resumes=True)
     if config.level != "all":
         policies = policies_folder(settings.policies, settings.scenario)
         own = settings.pov is not None
         levels = parse_levels(config.level, policies, own=own)
         settings = replace(settings, levels=levels)
     check_report(folder)
-    return run_and_report(settings, resolve(settings), folder, where, config, resumes=True)
+    return run_and_report(settings, settings.load_plan(), folder, config, resumes=True)
 
 
 def open_run(folder: c.AnyPath) -> CampaignRun:
@@ -200,13 +195,13 @@ def open_run(folder: c.AnyPath) -> CampaignRun:
 def run(config: c.RunCase) -> CaseRun:
     """Run one case and return it."""
     check_from(config.from_s)
-    before = None if config.recorded is None else recorded(config.recorded[0])
+    before = None if config.recorded is None else open_recorded(config.recorded[0])
     settings, case = planned_case(config, before)
     if config.out is not None:
         check_new(Path(config.out))
     for sentence in outside_of_the_pool(case):
         notice(sentence)
-    plan = resolve(settings, debug=config.debug)
+    plan = settings.load_plan(debug=config.debug)
     if before is not None:
         run_study.notice_changes(before, plan)
     if config.gui:
@@ -230,7 +225,7 @@ def run(config: c.RunCase) -> CaseRun:
 @verb(c.Rerun)
 def rerun(config: c.Rerun) -> comparison.Comparison:
     """Run recorded cases again with a changed VUT."""
-    before = recorded(config.run)
+    before = open_recorded(config.run)
     indices = (config.indices,) if isinstance(config.indices, int) else tuple(config.indices)
     chosen = rerunning.chosen(before, indices, config.level)
     out, junit = _new_files(config, SUFFIX if isinstance(before, cases_file.CasesFile) else PAGE)
@@ -352,8 +347,8 @@ def compare(config: c.Compare) -> comparison.Comparison:
 @verb(c.GroundTruth)
 def truth(config: c.GroundTruth) -> TruthResult:
     """Find the ground truth of a VUT by uniform cases."""
-    settings, where = settings_for(config)
-    with opened_truths(settings, where, config.engine) as study:
+    settings = settings_from_config(config)
+    with opened_truths(settings, config, config.engine) as study:
         return study.truths(settings, config)
 
 
@@ -364,10 +359,12 @@ def benchmark(config: c.Benchmark) -> sampler_study.SamplerStudy:
     if picture is not None:
         figures.check_figure(picture)
     names = sampler_study.names_of(config)
-    settings, where = settings_for(config, sampler=names[0], cases=config.cases, batch=config.batch)
+    settings = settings_from_config(
+        config, sampler=names[0], cases=config.cases, batch=config.batch
+    )
     for name in names[1:]:
         replace(settings, sampler=name)
-    with opened_truths(settings, where) as study:
+    with opened_truths(settings, config) as study:
         result = study.compare(settings.levels, names, config)
     if picture is None:
         return result
@@ -434,10 +431,10 @@ def vuts(config: c.Vuts) -> Shown:
 @verb(c.CheckVut)
 def check_vut(config: c.CheckVut) -> vut_check.VutCheck:
     """Let a VUT drive a few cases and report its faults."""
-    spec, _, _ = drivers_of(config.vut, None, 1)
+    spec = spec_of_driver(config.vut)
     policies = None if config.policies is None else str(config.policies)
-    fields = {"vut": spec, "levels": (0,), "policies": policies, **c.changed(config, c.Limits)}
-    scenario = changed_scenario(config.scenario or US23)
+    fields = {"vut": spec, "levels": (0,), "policies": policies, **c.non_defaults(config, c.Limits)}
+    scenario = scenario_from(config.scenario or US23)
     with Bars() as bars:
         bars.say(f"{printable(spec)} drives a few cases: minutes, where a step takes seconds")
         return vut_check.check_vut(CampaignSettings(scenario=scenario, **fields))
@@ -458,7 +455,7 @@ def new_scenario(config: c.NewScenario) -> Shown:
 def check_scenario(config: c.CheckScenario) -> Shown:
     """Say whether a scenario can be hosted, and whether the learned drivers were trained on it."""
     folder = None if config.policies is None else policies_in(config.policies)
-    scenario = changed_scenario(config.scenario)
+    scenario = scenario_from(config.scenario)
     name = scenario.name if isinstance(config.scenario, Scenario) else str(config.scenario)
     return own_scenario.check_scenario(scenario, name, folder)
 
@@ -468,7 +465,7 @@ def train(config: c.Train) -> PolicyChecks:
     """Train the learned drivers and return what each loses in SUMO, by the name of the network."""
     from merge_sumo.training.helix import train_and_check
 
-    scenario = None if config.scenario is None else changed_scenario(config.scenario)
+    scenario = None if config.scenario is None else scenario_from(config.scenario)
     with Bars(shown=config.progress) as bars:
         return train_and_check(config, scenario, bars.counted, bars.say)
 
@@ -479,7 +476,7 @@ def train(config: c.Train) -> PolicyChecks:
 @contextmanager
 def opened_study(
     run: RecordedCampaign,
-    config: c.Recorded,
+    config: c.StudyOptions,
     title: str,
     total: int | Mapping[Engine, int],
     unit: str = "cases",
@@ -496,38 +493,36 @@ def opened_study(
         unit: name of the counted things.
         engine: what moves the vehicles.
     """
-    overrides, where = explicit(config, run.vut)
-    settings = settings_of(run.folder, run.record, overrides)
-    plan = resolve(settings)
-    plan = plan.with_engine(engine)
+    settings = settings_from_folder(run.folder, run.record, named_settings(config))
+    plan = settings.load_plan().with_engine(engine)
     number = total if isinstance(total, int) else total[plan.engine]
-    bar = Counter(title.format(vut=settings.vut), number, unit, shown=where.progress)
-    with open_workers(plan.workers(where.workers)) as workers, bar:
+    bar = Counter(title.format(vut=settings.vut), number, unit, shown=config.progress)
+    with open_workers(plan.workers(config.workers)) as workers, bar:
         yield run_study.RunStudy(run, settings, plan, workers, bar.ended)
 
 
 @contextmanager
 def opened_truths(
-    settings: CampaignSettings, where: c.Execution, engine: str | None = None
+    settings: CampaignSettings, config: c.Execution, engine: str | None = None
 ) -> Iterator[sampler_study.Study]:
     """Open a study of truths; the truths of objects of this process are not kept.
 
     Args:
         settings: the settings of the study.
-        where: where its cases run.
+        config: where its cases run.
         engine: engine that moves the vehicles; by default the kinematic one where it is possible.
 
     Raises:
         UserError: for an engine that a level does not allow.
     """
-    plan = resolve(settings)
+    plan = settings.load_plan()
     for level in settings.levels:
         plan.at_level(level).with_engine(engine)
     passing = is_in_process(settings.vut) or is_in_process(settings.pov or "")
     with (
-        open_workers(plan.workers(where.workers)) as workers,
+        open_workers(plan.workers(config.workers)) as workers,
         ScratchFolder() as folder,
-        Bars(shown=where.progress) as bars,
+        Bars(shown=config.progress) as bars,
     ):
         yield sampler_study.Study(
             plan, workers, Path(folder) if passing else None, bars.counted, engine
@@ -539,18 +534,10 @@ def path_of(path: Path | str | None) -> Path | None:
     return None if path is None else Path(path)
 
 
-def _workers_for(settings: CampaignSettings, named: AnyWorkers) -> AnyWorkers:
-    """Return the workers that are named; without, one where more would not pay."""
-    if named is None and settings.cases <= FEW_CASES and not settings.may_vary:
-        return 1
-    return named
-
-
 def run_and_report(
     settings: CampaignSettings,
     plan: SimulationPlan,
     folder: Path,
-    where: c.Execution,
     config: c.CampaignCalls,
     *,
     resumes: bool = False,
@@ -563,8 +550,7 @@ def run_and_report(
         settings: the settings of the campaign.
         plan: how its cases run.
         folder: a new folder, or that of the campaign.
-        where: where its cases run.
-        config: gates, JUnit file, and functions that are called.
+        config: gates, JUnit file, workers, and functions that are called.
         resumes: whether the campaign continues in the folder.
     """
     junit = path_of(config.junit)
@@ -572,7 +558,7 @@ def run_and_report(
     if junit is not None:
         check_junit(junit, folder)
     check = config.check or (lambda: None)
-    bars = CampaignBars(folder, settings.cases, settings.tolerated, shown=where.progress)
+    bars = CampaignBars(folder, settings.cases, settings.tolerated, shown=config.progress)
     title = f"{settings.vut} v level {'/'.join(map(level_name, settings.levels))}"
 
     def on_cases(outcomes: Sequence[Outcome]) -> None:
@@ -581,9 +567,9 @@ def run_and_report(
                 config.on_case(outcome)
         check()
 
-    count = plan.workers(_workers_for(settings, where.workers))
+    workers = plan.workers(config.workers, settings.cases)
     try:
-        with open_workers(count) as available, bars, RunningReport(folder) as report:
+        with open_workers(workers) as available, bars, RunningReport(folder) as report:
             callbacks = bars.ended, report.rewrite, on_cases
             begin = partial(bars.begin, title)
             done = run_campaign(
@@ -602,9 +588,9 @@ def run_and_report(
             link_latest(folder)
             # Gates, files and the address of a cluster are not among the settings.
             gates = list(config.gates) or None
-            cluster = where.workers if isinstance(where.workers, str) else None
+            cluster = workers if isinstance(workers, str) else None
             more = {"gates": gates, "junit": junit, "workers": cluster}
-            command = again("resume", folder, asdict(settings), **more)
+            command = campaign_command("resume", folder, asdict(settings), **more)
             stop.add_note(f"continue with: {command}")
         raise
     if junit is not None:

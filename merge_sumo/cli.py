@@ -50,7 +50,7 @@ GROUPS: Mapping[type[Any], Group] = {
     c.Test: TESTED,
     c.ScenarioChanges: TESTED,
     c.Levels: TESTED,
-    c.Recorded: TESTED,
+    c.StudyOptions: TESTED,
     c.FailureRule: FAILURE,
     c.Search: CASES,
     c.Execution: PLACE,
@@ -359,8 +359,8 @@ def rerun(
         result = ms.rerun(**vars(config))
         page = {"page" if result.text is None else "cases": config.out}
         return print_result(result, json, **page)
-    options = c.values_of(config, c.Recorded)
-    if c.changed(config, c.Rerun).keys() - options.keys() - {"run"}:
+    options = c.values_of(config, c.StudyOptions)
+    if c.non_defaults(config, c.Rerun).keys() - options.keys() - {"run"}:
         raise UserError("--stress runs all cases: leave indices, --level, --out and --junit away")
     return print_result(ms.stress(config.run, **options), json)
 

@@ -140,14 +140,10 @@ class Execution:
     progress: bool | None = None
     """Show progress; by default in a notebook and on a terminal."""
 
-    def __post_init__(self) -> None:
-        if self.workers == "auto":
-            object.__setattr__(self, "workers", None)
-
 
 @dataclass(frozen=True, kw_only=True)
-class Recorded(Execution, Drivers):
-    """How cases of a recorded campaign run."""
+class StudyOptions(Execution, Drivers):
+    """How a study runs cases of a recorded campaign."""
 
     vut: AnyVut | None = None
     """Vehicle under test, perhaps a changed one. A file, module, command or model is always named
@@ -323,7 +319,7 @@ class RunCase(CaseOptions):
 
 
 @dataclass(frozen=True)
-class Probability(EngineChoice, Recorded):
+class Probability(EngineChoice, StudyOptions):
     """Estimate how likely a VUT is to fail, with an interval that is valid.
 
     The cases of the campaign were chosen to fail: they only say where failures are expected. Fresh
@@ -359,7 +355,7 @@ class Probability(EngineChoice, Recorded):
 
 
 @dataclass(frozen=True)
-class Explain(Recorded):
+class Explain(StudyOptions):
     """Say why a failure fails: the smallest change of one thing with which it passes.
 
     Each coordinate of the start, the level of the POV and each named parameter changes by itself:
@@ -433,7 +429,7 @@ class Report:
 
 
 @dataclass(frozen=True)
-class Rerun(Page, Levels, Recorded):
+class Rerun(Page, Levels, StudyOptions):
     """Run recorded cases again with a changed VUT, and say which broke and which are fixed.
 
     The cases are those of the old version's search: `campaign --against` searches where the new one
@@ -460,7 +456,7 @@ class Rerun(Page, Levels, Recorded):
 
 
 @dataclass(frozen=True)
-class Stress(Recorded):
+class Stress(StudyOptions):
     """Measure how results change with the simulation; the same as `merge-sumo rerun --stress`.
 
     `robust` of the result has the failures that fail every time, the worst first.
@@ -664,7 +660,7 @@ def values_of(config: object, kind: type[Any]) -> dict[str, Any]:
     return {one.name: getattr(config, one.name) for one in fields(kind)}
 
 
-def changed(config: object, kind: type[Any]) -> dict[str, Any]:
+def non_defaults(config: object, kind: type[Any]) -> dict[str, Any]:
     """Return the same, of the fields that differ from their defaults."""
     found = values_of(config, kind)
     for field in fields(kind):

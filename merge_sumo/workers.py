@@ -221,25 +221,38 @@ class Workers(AbstractContextManager["Workers"]):
             self._executor.shutdown(wait=kind is None)
 
 
+AUTO = "auto"
 AnyWorkers = int | str | None
-"""A number of processes, the address of a Dask scheduler, or None for a process a core."""
+"""A number of processes, the address of a Dask scheduler, or "auto" (None) for one a core."""
 
 
-def workers_or_cores(workers: int | None) -> int:
-    """Return the number of workers: the given one, or one for each core."""
-    if workers is not None and (not isinstance(workers, Integral) or workers < 1):
-        raise UserError(f"`workers` is {workers!r}: it must be a whole number, 1 or more")
-    return workers or os.cpu_count() or 1
+def number_of_workers(requested: AnyWorkers) -> int:
+    """Return a number of worker processes; one for each core for "auto" and None.
+
+    Raises `UserError` for another value.
+    """
+    if requested in (None, AUTO):
+        return os.cpu_count() or 1
+    if not isinstance(requested, Integral) or requested < 1:
+        raise UserError(f"`workers` is {requested!r}: it must be a whole number, 1 or more")
+    return int(requested)
 
 
-def open_workers(workers: AnyWorkers = None) -> Workers:
+def open_workers(workers: AnyWorkers = AUTO) -> Workers:
     """Return the workers of the cluster at an address, or else local ones.
 
-    One local worker is this process; more are processes of their own.
+    One local worker is this process; more are processes of their own. `SimulationPlan.workers`
+    decides how many a plan has.
+
+    Args:
+        workers: number, address, or "auto".
+
+    Raises:
+        UserError: there is no cluster at the address, or the value is neither of them.
     """
-    if isinstance(workers, str):
+    if isinstance(workers, str) and workers != AUTO:
         return dask_workers(workers)
-    count = workers_or_cores(workers)
+    count = number_of_workers(workers)
     if count > 1 and multiprocessing.current_process().daemon:
         notice(
             "the cases run in this process, as a daemonic process, such as a worker of "

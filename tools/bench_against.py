@@ -30,7 +30,6 @@ from merge_sumo.analysis.sampler_study import search
 from merge_sumo.analysis.truth import ground_truth
 from merge_sumo.campaigns.campaign import controller_model_of
 from merge_sumo.campaigns.loop import Batches, SearchLoop
-from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.metrics.fmc import covered
 from merge_sumo.metrics.outcome import Outcome
@@ -80,7 +79,7 @@ class Versions:
 
     def __init__(self, pair: Pair, truth_cases: int) -> None:
         self.pair = pair
-        self.both = resolve(pair.settings(1, 0)).with_engine(None)
+        self.both = pair.settings(1, 0).load_plan().with_engine(None)
         self.new = replace(self.both, against=None)
         assert self.both.earlier is not None, "a pair"  # noqa: S101
         self.old = self.both.earlier

@@ -28,7 +28,6 @@ from merge_sumo.analysis.probability import (
 from merge_sumo.analysis.run_study import RunStudy
 from merge_sumo.api import truth as truth_of
 from merge_sumo.campaigns.campaign import run_campaign
-from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.metrics.summary import clopper_pearson
 from merge_sumo.scenario.scenario import US23
@@ -43,7 +42,7 @@ def main() -> None:
     parser.add_argument("--truth-cases", type=int, default=1_000_000)
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
-        plan = resolve(CAMPAIGN)
+        plan = CAMPAIGN.load_plan()
         study = RunStudy(run_campaign(CAMPAIGN, plan, Path(folder) / "run"), CAMPAIGN, plan)
         cells = expected_cells(study, read_distribution(None, (0,), US23))
     truth = truth_of("design1", 0, cases=options.truth_cases).truths[0]

@@ -29,7 +29,6 @@ from oracle import greedy_cover
 from merge_sumo.analysis.sampler_study import COMPARED_BATCH, search
 from merge_sumo.analysis.truth import DENSE_CASES, ground_truth
 from merge_sumo.campaigns.campaign import controller_model_of
-from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.metrics.fmc import fmc
 from merge_sumo.metrics.outcome import Prediction
@@ -65,7 +64,7 @@ def dense(options: argparse.Namespace, names: Sequence[str]) -> dict[str, Any]:
     """Print and return how soon samplers find the failures of a dense truth."""
     level, cases = options.level, options.cases
     settings = CampaignSettings(vut=options.vut, levels=(level,), scenario=US23)
-    plan = resolve(settings).with_engine(Engine.KINEMATIC)
+    plan = settings.load_plan().with_engine(Engine.KINEMATIC)
     truth = ground_truth(plan, level, DENSE_CASES).failures
     shown = [n for n in SHOWN if n <= cases]
     whole, (best, _) = fmc(truth), greedy_cover(truth, cases)
@@ -94,7 +93,7 @@ def dense(options: argparse.Namespace, names: Sequence[str]) -> dict[str, Any]:
 
 def cost_of_batches(_: object, names: Sequence[str]) -> dict[str, dict[int, float]]:
     """Print and return the CPU seconds of a batch after N cases of `design1` at level 2."""
-    plan = resolve(CampaignSettings(vut="design1", levels=(2,), scenario=US23))
+    plan = CampaignSettings(vut="design1", levels=(2,), scenario=US23).load_plan()
     (known,) = search(plan, (2,), HISTORIES[-1], None, [("uniform", 0)])
     print(f"{'seconds for a batch after N =':30s}" + " ".join(f"{n:7d}" for n in HISTORIES))
     figures: dict[str, dict[int, float]] = {}
@@ -114,7 +113,7 @@ def cost_of_batches(_: object, names: Sequence[str]) -> dict[str, dict[int, floa
 def cost_of_cases(*_: object) -> dict[str, dict[int, float]]:
     """Print and return what `coverage` with its model takes for a case after N of design2."""
     settings = CampaignSettings(vut="design2", levels=LEVELS, scenario=US23)
-    plan, pool = resolve(settings), settings.pool
+    plan, pool = settings.load_plan(), settings.pool
     cases = make_sampler("uniform", pool, 0).ask(MODEL_HISTORIES[-1])
     order, rng = np.random.default_rng(1).permutation(len(cases)), np.random.default_rng(2)
     outcomes, motions = [], {}

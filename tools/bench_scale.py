@@ -45,7 +45,6 @@ from merge_sumo.analysis.truth import ground_truth
 from merge_sumo.campaigns.campaign import run_campaign
 from merge_sumo.campaigns.journal import Journal, to_line
 from merge_sumo.campaigns.loop import SearchLoop
-from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.recorded import OUTCOMES, RecordedCampaign, failures, read_outcomes
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.metrics.fmc import fmc, regions
@@ -100,7 +99,7 @@ def run_uniform(workers: Workers, points: FloatArray) -> float:
     """Run the cases at points, (n, 2), and return the largest memory of a worker in MB."""
     cases = Pool(levels=(0,), scenario=US23).cases(points, 0)
     largest_mb = 0.0
-    for _, mb in evaluate(resolve(UNIFORM), cases, workers, failed_and_memory):
+    for _, mb in evaluate(UNIFORM.load_plan(), cases, workers, failed_and_memory):
         largest_mb = max(largest_mb, mb)
     return largest_mb
 
@@ -190,7 +189,7 @@ class Served(Workers):
 
 def main_process_rate(cases: int) -> float:
     """Return how many cases per second a campaign takes that workers have run."""
-    plan, pool = resolve(UNIFORM), UNIFORM.pool
+    plan, pool = UNIFORM.load_plan(), UNIFORM.pool
     served = Served(simulate(plan, pool.cases(np.random.default_rng(3).random((500, 2)), 0)))
     loop = SearchLoop(make_sampler("uniform", pool, 0), plan, cases, workers=served, batch=BATCH)
     with tempfile.TemporaryDirectory() as scratch:
@@ -201,7 +200,7 @@ def main_process_rate(cases: int) -> float:
 
 def engines(_: int) -> Figures:
     """Return the CPU time of a case by each engine, in us, and its ratio, round by round."""
-    plan = resolve(CampaignSettings(vut="design2", levels=(2,), scenario=US23))
+    plan = CampaignSettings(vut="design2", levels=(2,), scenario=US23).load_plan()
     plans = {"sumo": plan, "kinematic": plan.with_engine("kinematic")}
     pool, rng = Pool(levels=(2,), scenario=US23), np.random.default_rng(2)
     figures: Figures = {"sumo, us": [], "kinematic, us": [], "ratio": []}
@@ -288,7 +287,7 @@ def cases_to_most(flight: int | None, seed: int, levels: tuple[int, ...]) -> flo
     settings = CampaignSettings(
         vut="design2", levels=levels, scenario=US23, cases=SEARCHED, seed=seed, in_flight=flight
     )
-    plan = resolve(settings)
+    plan = settings.load_plan()
     target = 0.9 * sum(fmc(ground_truth(plan, level).failures) for level in levels)
     with tempfile.TemporaryDirectory() as scratch:
         outcomes = run_campaign(settings, plan, Path(scratch) / "run").outcomes
@@ -306,7 +305,7 @@ def files(most: int) -> Figures:
     """Return the seconds for a finished campaign of 10,000, 100,000, ... cases."""
     figures: Figures = {}
     with tempfile.TemporaryDirectory() as scratch:
-        run = run_campaign(UNIFORM, resolve(UNIFORM), Path(scratch) / "run")
+        run = run_campaign(UNIFORM, UNIFORM.load_plan(), Path(scratch) / "run")
         known, count = run.outcomes, 10_000
         while count <= most:
             cases = from_unit(np.random.default_rng(2).random((count, 2)), 0, scenario=US23)

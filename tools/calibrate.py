@@ -21,7 +21,6 @@ from typing import Any
 
 import numpy as np
 
-from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.drivers.base import Design
 from merge_sumo.drivers.gap_acceptance import GapDesign
@@ -84,7 +83,7 @@ def picture(vut: str, design: Design, level: int, scenario: Scenario, apart: flo
     """
     parameters = "&".join(f"{name}={value}" for name, value in asdict(design).items())
     settings = CampaignSettings(vut=f"{vut}?{parameters}", levels=(level,), scenario=scenario)
-    plan = resolve(settings).with_engine(Engine.KINEMATIC).for_verdicts()
+    plan = settings.load_plan().with_engine(Engine.KINEMATIC).for_verdicts()
     count = CASES[scenario.name] * (2 if level == 2 else 1)
     rng = np.random.default_rng([SEED[scenario.name], level])
     points = rng.random((count, len(scenario.dimensions(level))))

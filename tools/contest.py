@@ -56,7 +56,7 @@ from merge_sumo.records import decode
 from merge_sumo.reports.progress import Bars
 from merge_sumo.scenario.case import to_unit
 from merge_sumo.simulation.plan import SimulationPlan
-from merge_sumo.workers import LocalProcesses, Workers, workers_or_cores
+from merge_sumo.workers import LocalProcesses, Workers, number_of_workers
 
 COUNTED = (50, 100, 400)
 """Numbers of cases N after which the share counts."""
@@ -419,7 +419,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options = parsed(arguments)
     folder, problems = options.out / SEARCHES, options.problems
     found: dict[Search, Found] = {}
-    with Workers(LocalProcesses, workers_or_cores(options.workers)) as workers, Bars() as bars:
+    with Workers(LocalProcesses, number_of_workers(options.workers)) as workers, Bars() as bars:
         entered = enter(options.samplers, options.limit, workers)
         truths = {problem.name: shipped_truth(problem) for problem in problems}
         for number, problem in enumerate(problems, start=1):

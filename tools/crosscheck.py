@@ -28,9 +28,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 import merge_sumo as ms
-from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.recorded import RecordedCampaign
-from merge_sumo.campaigns.settings import CampaignSettings, settings_of
+from merge_sumo.campaigns.settings import CampaignSettings, settings_from_folder
 from merge_sumo.errors import UserError
 from merge_sumo.road.loader import centre_lines
 from merge_sumo.road.road import Road
@@ -162,8 +161,8 @@ class Crosscheck:
 
 def crosscheck(run: RecordedCampaign, cases: int, seed: int) -> Crosscheck:
     """Let HighwayEnv repeat the cases of a campaign, and fresh uniform ones up to `cases`."""
-    settings = settings_of(run.folder, run.record)
-    plan = resolve(settings)
+    settings = settings_from_folder(run.folder, run.record)
+    plan = settings.load_plan()
     if plan.needs_sumo is not None:
         raise UserError(f"{plan.needs_sumo}: name a campaign of a VUT of this package")
     known = run.trajectories(outcome.index for outcome in run.outcomes)

@@ -28,10 +28,9 @@ import numpy as np
 
 from merge_sumo.campaigns import journal
 from merge_sumo.campaigns.campaign import run_campaign
-from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.recorded import OUTCOMES, SETTINGS, read_settings
 from merge_sumo.campaigns.settings import CampaignSettings
-from merge_sumo.campaigns.settings import settings_of as settings_in
+from merge_sumo.campaigns.settings import settings_from_folder as settings_in
 from merge_sumo.scenario.scenario import US23
 from merge_sumo.sumo.binding import load_libsumo
 from merge_sumo.workers import open_workers
@@ -134,7 +133,7 @@ def disturb(
         if place == "torn":
             kill_at_write(int(rng.integers(1, WRITES + 1)), float(rng.random()))
         with open_workers(2 if place == "worker" else 1) as workers:
-            run_campaign(settings, resolve(settings), folder, workers=workers)
+            run_campaign(settings, settings.load_plan(), folder, workers=workers)
 
     pid = forked(campaign)
     if place == "moment":
@@ -159,13 +158,13 @@ def disturb(
 
 def begin(settings: CampaignSettings, folder: Path) -> None:
     """Run a campaign."""
-    run_campaign(settings, resolve(settings), folder)
+    run_campaign(settings, settings.load_plan(), folder)
 
 
 def go_on(folder: Path) -> None:
     """Go on with a campaign."""
     settings = settings_in(folder, read_settings(folder))
-    run_campaign(settings, resolve(settings), folder, resumes=True)
+    run_campaign(settings, settings.load_plan(), folder, resumes=True)
 
 
 def main() -> None:

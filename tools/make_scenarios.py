@@ -13,7 +13,6 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.metrics.measures import Measures
 from merge_sumo.metrics.outcome import Outcome
@@ -84,7 +83,7 @@ def play(example: Example) -> Trajectory:
     scenario = example.case.scenario
     level = example.case.level
     settings = CampaignSettings(vut=example.vut, levels=(level,), scenario=scenario)
-    with Simulator(resolve(settings).for_cases(1)) as ground:
+    with Simulator(settings.load_plan().for_cases(1)) as ground:
         (trajectory,) = ground.run([example.case])
     return trajectory
 

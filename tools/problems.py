@@ -17,7 +17,6 @@ import frozen_vuts  # noqa: F401 (registers the VUTs)
 import numpy as np
 from numpy.typing import NDArray
 
-from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.errors import UserError
 from merge_sumo.files import sha256_of
@@ -71,7 +70,7 @@ class Problem:
 
     def plan(self) -> SimulationPlan:
         """Return how its cases run: by the kinematic engine where VUT and POVs need no SUMO."""
-        return resolve(self.settings()).with_engine(None)
+        return self.settings().load_plan().with_engine(None)
 
 
 SENSE = "delay_s=1,noise_x_m=5,noise_v_mps=1"

@@ -18,7 +18,6 @@ from pathlib import Path
 from merge_sumo.analysis.counterfactuals import TAKES_OVER, write_avoidance
 from merge_sumo.analysis.run_study import RunStudy
 from merge_sumo.campaigns.campaign import run_campaign
-from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.drivers.reference import REFERENCES
 from merge_sumo.metrics.summary import summarise
@@ -52,7 +51,7 @@ def row(vut: str, cases: int, workers: int | None) -> str:
                 batch=min(cases, 500),
                 scenario=US23,
             )
-            plan = resolve(settings)
+            plan = settings.load_plan()
             with open_workers(plan.workers(workers)) as there:
                 run = run_campaign(settings, plan, Path(folder) / str(level), workers=there)
                 failing = write_avoidance(RunStudy(run, settings, plan, there))

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from merge_sumo.campaigns.again import command
+from merge_sumo.campaigns.printed_commands import command
 from merge_sumo.campaigns.recorded import RecordedCampaign
 from merge_sumo.campaigns.settings import same_pov
 from merge_sumo.errors import UserError

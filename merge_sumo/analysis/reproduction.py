@@ -18,7 +18,6 @@ from merge_sumo import config
 from merge_sumo.analysis.run_study import OnPart, check_least
 from merge_sumo.analysis.sampler_study import SamplerRun, SamplerStudy, Study
 from merge_sumo.analysis.truth import TRUTH_CASES
-from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.drivers.policies import policies_of
 from merge_sumo.metrics.fmc import fmc
@@ -229,7 +228,7 @@ def reproduce(
     for vut in ("design1", "design2"):
         folder = str(povs.policies)
         settings = CampaignSettings(vut=vut, levels=(0,), scenario=US23, policies=folder)
-        studies[vut] = Study(resolve(settings), workers or Workers(), on_part=on_part)
+        studies[vut] = Study(settings.load_plan(), workers or Workers(), on_part=on_part)
     columns = {}
     for column in TABLE_II:
         # In batches of Table II's size; those of `coverage` are a part of it.

@@ -17,9 +17,9 @@ from merge_sumo.analysis.comparison import (
     with_shares,
 )
 from merge_sumo.analysis.run_study import RunStudy
-from merge_sumo.campaigns.again import command
+from merge_sumo.campaigns.printed_commands import command
 from merge_sumo.campaigns.recorded import RecordedCampaign
-from merge_sumo.campaigns.repeats import others_drive, repeat_of, unrepeatable
+from merge_sumo.campaigns.repeatability import may_not_repeat, second_run_of, unrepeatable
 from merge_sumo.errors import UserError
 from merge_sumo.files import free
 from merge_sumo.metrics.outcome import Episode, Outcome
@@ -97,13 +97,13 @@ def rerun(study: RunStudy, recorded: Sequence[Outcome]) -> Comparison:
         cases.append(one)
         if one.change in AGAIN and one.later_runs is None:
             changed.append(one.later)
-    second_episodes = _episodes(study, others_drive(changed, settings))
+    second_episodes = _episodes(study, may_not_repeat(changed, settings))
     repeats = []
     for row, one in enumerate(cases):
         second = second_episodes.get(one.later.index)
         if second is None:
             continue
-        repeats.append(repeat_of(one.later, motions[one.later.index], second))
+        repeats.append(second_run_of(one.later, motions[one.later.index], second))
         # Where the VUT reaches its goal neither time, the change is not chance.
         if not repeats[-1].same and (one.later.is_tested or second.outcome.is_tested):
             cases[row] = replace(one, change=Change.NOT_REPEATABLE)

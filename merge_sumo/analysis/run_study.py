@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 from merge_sumo.campaigns.recorded import RecordedCampaign
-from merge_sumo.campaigns.settings import CampaignSettings, record_of, same_pov
+from merge_sumo.campaigns.settings import CampaignSettings, same_pov
 from merge_sumo.errors import UserError, notice
 from merge_sumo.files import check_generated, files_now, replace_own
 from merge_sumo.metrics.outcome import Episode
@@ -86,7 +86,7 @@ class RunStudy:
     """A recorded campaign, and how a study runs cases of it.
 
     Example:
-        study = RunStudy(run, settings, resolve(settings))
+        study = RunStudy(run, settings, settings.load_plan())
         margins = study.simulate(study.plan, cases, margin_of)
 
     Attributes:
@@ -122,7 +122,7 @@ class RunStudy:
 
     def record(self) -> dict[str, Any]:
         """Return the settings, versions and hashes of the study, as in `campaign.json`."""
-        return record_of(self.settings, self.plan)
+        return self.settings.to_record(self.plan)
 
     def check_same_system(self, *, may_change: bool = False) -> None:
         """Raise `UserError` where the campaign had another net or other POVs.

@@ -16,7 +16,7 @@ from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.samplers.surrogate import JUDGED_FROM, learn_chance
 from merge_sumo.samplers.uniform import UniformSampler
 from merge_sumo.scenario.case import FloatArray, Pool
-from merge_sumo.workers import workers_or_cores
+from merge_sumo.workers import number_of_workers
 
 FEWEST_FAILURES = 5
 """Failures at a level from which a surrogate is learned. Chosen, not tuned."""
@@ -37,7 +37,7 @@ class Surface:
         """Return the chance that cases at points, (n, d), of the unit cube fail: (n,)."""
         parts = np.array_split(points, len(points) // PART + 1)
         # Each part in one thread: the answer is the same whatever the number of cores.
-        with threadpool_limits(1), ThreadPoolExecutor(workers_or_cores(None)) as cores:
+        with threadpool_limits(1), ThreadPoolExecutor(number_of_workers(None)) as cores:
             return np.concatenate(list(cores.map(self.predict, parts)))
 
 

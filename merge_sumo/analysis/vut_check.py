@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 
-from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.controllers.built_in import BUILT_IN_VUTS
 from merge_sumo.controllers.kinds import KINDS
@@ -75,7 +74,7 @@ def check_vut(settings: CampaignSettings) -> VutCheck:
     notes: list[str] = []
     cost_us: list[float] = []
     try:
-        plan = resolve(settings).for_cases(CORRIDORS)
+        plan = settings.load_plan().for_cases(CORRIDORS)
         with _opened(plan) as simulator:
             timed = simulator.vut = _Timed(simulator.vut)
             problems, notes = _checked(simulator, plan)

@@ -11,8 +11,8 @@ from typing import Any
 from merge_sumo.campaigns.journal import Journal
 from merge_sumo.campaigns.loop import Batches, SearchLoop
 from merge_sumo.campaigns.recorded import AGAINST, FILES, TALLIES, RecordedCampaign, spread_failures
-from merge_sumo.campaigns.repeats import repeat
-from merge_sumo.campaigns.settings import CampaignSettings, record_of
+from merge_sumo.campaigns.repeatability import check_repeatability
+from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.controllers.process import LOG
 from merge_sumo.errors import UserError, notice
 from merge_sumo.files import TakenError, check_new, check_own, files_now
@@ -57,8 +57,8 @@ def run_campaign(
 
     Args:
         settings: what to run; of a campaign that resumes, those of the folder, and those that were
-            named again (`settings_of`).
-        plan: how its cases run: that of the settings (`resolve`).
+            named again (`settings_from_folder`).
+        plan: how its cases run: that of the settings (`load_plan`).
         folder: where to.
         callbacks: called in turn with the outcomes of one or more groups when they are stored.
         resumes: whether the folder has a campaign that was stopped, however it was.
@@ -109,8 +109,10 @@ def run_campaign(
         loop.run(on_batches)
         done = RecordedCampaign(folder)
         if plan.earlier is not None:
-            repeat(RecordedCampaign(folder / AGAINST), settings.earlier, plan.earlier, available)
-        repeat(done, settings, replace(plan, against=None), available)
+            check_repeatability(
+                RecordedCampaign(folder / AGAINST), settings.earlier, plan.earlier, available
+            )
+        check_repeatability(done, settings, replace(plan, against=None), available)
     for outcome in spread_failures(done.cases)[:EXPORTED_FAILURES]:
         with suppress(TakenError):  # whatever it is, the campaign has ended
             export_case(done, outcome.index, folder / SCENARIOS / case_name(outcome.index))
@@ -121,7 +123,7 @@ def _created(
     settings: CampaignSettings, plan: SimulationPlan, folder: Path, opened: ExitStack
 ) -> Journal:
     """Return the journal of a new folder, which `opened` closes."""
-    journal = opened.enter_context(Journal.create(folder, record_of(settings, plan)))
+    journal = opened.enter_context(Journal.create(folder, settings.to_record(plan)))
     if plan.earlier is not None:
         journal.earlier = _created(settings.earlier, plan.earlier, folder / AGAINST, opened)
     return journal
@@ -174,7 +176,7 @@ def _continued(
     Raises `UserError` where something differs that decides outcomes: cases of two controllers are
     not a campaign.
     """
-    recorded, record = dict(before.record), record_of(settings, plan)
+    recorded, record = dict(before.record), settings.to_record(plan)
     # The content of policies decides outcomes, and not their folder.
     recorded["policies"] = record["policies"]
     # Files that were loaded while it ran must be the same, although they are not loaded yet.

@@ -17,7 +17,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from merge_sumo.campaigns.again import again
+from merge_sumo.campaigns.printed_commands import campaign_command
 from merge_sumo.campaigns.recorded import (
     FILES,
     IN_VAIN,
@@ -139,7 +139,7 @@ class Journal:
                 self._outcomes.truncate(end)
                 raise
         except OSError as error:
-            resume = again("resume", self.folder, self.settings)
+            resume = campaign_command("resume", self.folder, self.settings)
             raise UserError(
                 f"{cannot_write(self.folder, error)}; when it can be written, continue with "
                 f"`{resume}`"
@@ -159,7 +159,7 @@ class Journal:
         for command in episode.trajectory.in_vain:
             cases = noted.get(IN_VAIN, {})
             noted[IN_VAIN] = cases | {command: cases.get(command, 0) + 1}
-        if episode.again:
+        if episode.ran_again:
             noted[RAN_AGAIN] = noted.get(RAN_AGAIN, 0) + 1
 
     def write_settings(self) -> None:

@@ -203,7 +203,7 @@ class SearchLoop:
         episodes = self._workers.collect(job)
         self._cases_ran += len(episodes)
         for place in job.retried:
-            episodes[place] = replace(episodes[place], again=True)
+            episodes[place] = replace(episodes[place], ran_again=True)
         rest = iter(episodes)
         for batch in batches:
             for index, prediction in enumerate(batch.predictions, batch.first_index):

@@ -69,8 +69,8 @@ ControllerText = Annotated[
 
 
 @dataclass(frozen=True, kw_only=True)
-class SharedSettings(Search):
-    """Settings that a campaign needs to run and a reader needs to show it."""
+class RecordedSettings(Search):
+    """The part of `campaign.json` that a reader needs; a missing key has its default."""
 
     vut: ControllerText = "None"
     levels: tuple[Annotated[int, Meta(ge=min(ALL_LEVELS), le=max(ALL_LEVELS))], ...] = ()
@@ -79,12 +79,6 @@ class SharedSettings(Search):
     against: ControllerText | None = None
     fail_when: str = PAPER_CRITERION.fail_when
     require: str | None = None
-
-
-@dataclass(frozen=True, kw_only=True)
-class RecordedSettings(SharedSettings):
-    """The part of `campaign.json` that a reader needs; a missing key has its default."""
-
     ran_again: int = 0
     in_vain: dict[str, int] = field(default_factory=dict)
     net_sha256: str | None = None
@@ -117,7 +111,7 @@ class RecordedCampaign:
     def _take(self, folder: Path, record: dict[str, Any], place: Path) -> None:
         """Take settings that are recorded at a place."""
         self.folder, self.record = folder, record
-        self.scenario = scenario_of(record, place)
+        self.scenario = recorded_scenario(record, place)
         self._batches: dict[int, dict[int, FloatArray]] = {}
         self._signals: dict[int, Signals] = {}
         """By index, of the batches that were read."""
@@ -316,7 +310,7 @@ def read_settings(folder: Path) -> dict[str, Any]:
     return settings
 
 
-def scenario_of(settings: Mapping[str, Any], path: Path) -> Scenario:
+def recorded_scenario(settings: Mapping[str, Any], path: Path) -> Scenario:
     """Return the scenario of a campaign, the paper's where it names none."""
     recorded = settings.get("scenario")
     try:

@@ -1,4 +1,4 @@
-"""Settings of a campaign, and their record in `campaign.json`."""
+"""Settings of a campaign: their record in `campaign.json`, and the plan of its simulation."""
 
 from __future__ import annotations
 
@@ -8,26 +8,26 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from merge_sumo.campaigns.again import CONTROLLERS
+from merge_sumo.campaigns.printed_commands import CONTROLLERS
 from merge_sumo.campaigns.recorded import (
     NAME_CHARACTERS,
     SETTINGS,
     ControllerText,
-    SharedSettings,
     has_converged,
-    scenario_of,
+    recorded_scenario,
 )
-from merge_sumo.config import Search, changed
+from merge_sumo.config import MOST_CASES, Search, non_defaults
 from merge_sumo.controllers.in_memory import names_code
-from merge_sumo.controllers.kinds import is_built_in, waits_for_client
+from merge_sumo.controllers.kinds import is_built_in, load, waits_for_client
 from merge_sumo.controllers.spec import ControllerOptions
 from merge_sumo.drivers.policies import policies_name
 from merge_sumo.errors import UserError
-from merge_sumo.metrics.criterion import Criterion
+from merge_sumo.metrics.criterion import PAPER_CRITERION, Criterion
 from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.metrics.summary import check_tolerated
 from merge_sumo.printable import printable
 from merge_sumo.records import RecordError, check_fields, to_plain
+from merge_sumo.road.loader import road_for
 from merge_sumo.samplers.base import Predictor, Sampler
 from merge_sumo.samplers.registry import SAMPLERS, make_sampler
 from merge_sumo.scenario.case import Pool
@@ -40,15 +40,40 @@ from merge_sumo.scenario.scenario import (
     level_name,
 )
 from merge_sumo.simulation.plan import SimulationPlan
-from merge_sumo.simulation.povs import POLICIES
+from merge_sumo.simulation.povs import POLICIES, Povs, own_pov, policies_folder
+
+DEBUG_DEADLINE_S = 86_400.0
+"""Deadline of a step while a user debugs."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class CampaignSettings(SharedSettings):
-    """Everything that decides the outcomes of a campaign; `UserError` for wrong values."""
+class CampaignSettings(Search):
+    """Everything that decides the outcomes of a campaign; `UserError` for wrong values.
+
+    Example:
+        settings = CampaignSettings(vut="design2", levels=(0,), scenario=US23, cases=100)
+        run = run_campaign(settings, settings.load_plan(), Path("runs/example"))
+
+    Attributes:
+        vut: spec of the VUT.
+        levels: POV levels, each once.
+        pov: spec of the POV at level own.
+        against: spec of an earlier version of the VUT, which runs the same cases.
+        fail_when: condition of a failure.
+        require: requirement in signal temporal logic; it replaces the condition.
+        scenario: the scenario.
+        policies: folder of the learned drivers; None for the shipped ones.
+        deadline_s: time that a controller may take for a step, in s.
+        vut_memory_gib: memory that the process of a controller may take, in GiB.
+    """
 
     vut: ControllerText
     levels: tuple[int, ...]
+    cases: int = MOST_CASES
+    pov: ControllerText | None = None
+    against: ControllerText | None = None
+    fail_when: str = PAPER_CRITERION.fail_when
+    require: str | None = None
     scenario: Scenario
     policies: str | None = None
     deadline_s: float = DEADLINE_S
@@ -67,7 +92,8 @@ class CampaignSettings(SharedSettings):
         object.__setattr__(self, "fail_when", criterion.fail_when)
         object.__setattr__(self, "require", criterion.require)
         criterion.check(self.scenario)
-        self.vut_options(None)
+        # Both raise for wrong values.
+        self._controller_options(None)
         self.new_sampler()
         check_tolerated(self.tolerated)
         if self.seed < 0:
@@ -111,7 +137,7 @@ class CampaignSettings(SharedSettings):
 
     def _check_against(self, against: str) -> None:
         for name in ("in_flight", "repeat", "tolerated"):
-            if name in changed(self, Search):
+            if name in non_defaults(self, Search):
                 raise UserError(
                     f"`{name}` does not go with `against`, which runs each batch with two "
                     "versions: leave one of them away"
@@ -157,8 +183,8 @@ class CampaignSettings(SharedSettings):
         """What counts as a failure."""
         return Criterion(self.fail_when, self.require)
 
-    def vut_options(self, policies: Path | None) -> ControllerOptions:
-        """Return how the VUT is hosted, with the learned drivers of a folder."""
+    def _controller_options(self, policies: Path | None) -> ControllerOptions:
+        """Return how controllers are hosted, with the learned drivers of a folder."""
         return ControllerOptions(
             deadline_s=self.deadline_s,
             memory_gib=self.vut_memory_gib,
@@ -170,20 +196,50 @@ class CampaignSettings(SharedSettings):
         """The cases to choose from."""
         return Pool(levels=self.levels, scenario=self.scenario)
 
+    def load_plan(self, *, debug: bool = False) -> SimulationPlan:
+        """Read all files that the settings name, and return the plan of the simulation.
 
-def record_of(settings: CampaignSettings, plan: SimulationPlan) -> dict[str, Any]:
-    """Return the content of `campaign.json`: everything that decides the outcomes."""
-    folder = None if settings.policies is None else policies_name(plan.povs.policies)
-    return {
-        **to_plain(settings),
-        "scenario": settings.scenario.to_record(),
-        "policies": folder,
-        "versions": dict(plan.versions),
-        "vut_files": plan.vut.files or None,
-        "pov_files": plan.povs.files or None,
-        "net_sha256": plan.road.sha256,
-        "policies_sha256": dict(plan.policies_sha256),
-    }
+        Args:
+            debug: whether a controller of the user's runs in this process, without a deadline.
+
+        Raises:
+            UserError: drivers, policies or a road are missing or cannot be loaded.
+        """
+        policies = policies_folder(self.policies, self.scenario)
+        options = self._controller_options(policies)
+        if debug:
+            options = replace(options, in_process=True, deadline_s=DEBUG_DEADLINE_S)
+        vut = load(self.vut, options)
+        own = None if self.pov is None else own_pov(self.pov, options)
+        povs = Povs(policies=policies, own=own)
+        for level in self.levels:
+            povs.check_level(level)
+        return SimulationPlan(
+            scenario=self.scenario,
+            road=road_for(self.scenario),
+            vut=vut,
+            against=None if self.against is None else load(self.against, options),
+            povs=povs,
+            criterion=self.criterion,
+        )
+
+    def to_record(self, plan: SimulationPlan) -> dict[str, Any]:
+        """Return the content of `campaign.json`: everything that decides the outcomes.
+
+        Args:
+            plan: the plan of these settings, for versions and hashes.
+        """
+        folder = None if self.policies is None else policies_name(plan.povs.policies)
+        return {
+            **to_plain(self),
+            "scenario": self.scenario.to_record(),
+            "policies": folder,
+            "versions": dict(plan.versions),
+            "vut_files": plan.vut.files or None,
+            "pov_files": plan.povs.files or None,
+            "net_sha256": plan.road.sha256,
+            "policies_sha256": dict(plan.policies_sha256),
+        }
 
 
 def same_pov(a: Mapping[str, Any], b: Mapping[str, Any], level: int) -> bool:
@@ -206,9 +262,9 @@ def same_pov(a: Mapping[str, Any], b: Mapping[str, Any], level: int) -> bool:
     return True
 
 
-def settings_of(
+def settings_from_folder(
     folder: Path,
-    recorded: Mapping[str, Any],
+    record: Mapping[str, Any],
     overrides: Mapping[str, object] | None = None,
     *,
     resumes: bool = False,
@@ -217,7 +273,7 @@ def settings_of(
 
     Args:
         folder: the folder, for messages.
-        recorded: content of its `campaign.json`.
+        record: content of its `campaign.json`.
         overrides: settings that replace recorded ones.
         resumes: whether the campaign continues: else it has no earlier version.
 
@@ -225,20 +281,20 @@ def settings_of(
         UserError: for a setting that is missing or wrong, and for a controller that is code and not
             among the overrides: a folder that was received runs no code.
     """
-    explicit = {**({} if resumes else {"against": None}), **(overrides or {})}
-    record = {**recorded, **explicit}
-    for name, spec in controllers(record).items():
-        if name not in explicit:
+    replaced = {**({} if resumes else {"against": None}), **(overrides or {})}
+    values = {**record, **replaced}
+    for name, spec in controllers(values).items():
+        if name not in replaced:
             raise UserError(
                 f"{folder} was run with {name} {printable(spec[:NAME_CHARACTERS])}, and a run "
                 f"folder names no code to run: name it again with `{name}`"
             )
-    if not isinstance(record.get("scenario"), Scenario):
-        record["scenario"] = scenario_of(record, folder / SETTINGS)
+    if not isinstance(values.get("scenario"), Scenario):
+        values["scenario"] = recorded_scenario(values, folder / SETTINGS)
     known = {}
     for field in fields(CampaignSettings):
-        if field.name in record:
-            known[field.name] = record[field.name]
+        if field.name in values:
+            known[field.name] = values[field.name]
         elif field.default is MISSING:
             raise UserError(f"{folder / SETTINGS}: it has no {field.name}")
     try:

@@ -16,7 +16,6 @@ from merge_sumo.controllers.python import InProcessKind, SeenBatch, object_of, o
 from merge_sumo.controllers.signatures import is_code
 from merge_sumo.controllers.spec import HERE, ControllerOptions, ControllerSpec
 from merge_sumo.errors import UserError, notice
-from merge_sumo.workers import AnyWorkers
 
 Answer = SupportsFloat | tuple[SupportsFloat, bool]
 """An acceleration, or it and whether to merge."""
@@ -80,28 +79,21 @@ def names_code(text: str) -> bool:
     return runs_code(text) and object_of(parse(text)) is None
 
 
-def drivers_of(vut: Any, pov: Any, workers: AnyWorkers) -> tuple[str, str | None, AnyWorkers]:
-    """Return the specs of both controllers, and the workers that can have them.
-
-    An object has no workers; a notice says so.
+def spec_of_driver(vut: Any) -> str:
+    """Return the spec of a controller; warn where it is an object, which has no workers.
 
     Args:
-        vut: the VUT, a spec or an object.
-        pov: the controller of the POV; None for the drivers of the scenario.
-        workers: the requested workers.
+        vut: a spec or an object.
     """
-    specs = spec_of(vut), None if pov is None else spec_of(pov)
-    for spec in map(parse, filter(None, specs)):
-        if object_of(spec) is None:
-            continue
-        workers = 1
+    spec = spec_of(vut)
+    if is_in_process(spec):
         notice(
-            f"{spec.argument} is an object, so it drives in this process, without workers, "
+            f"{parse(spec).argument} is an object, so it drives in this process, without workers, "
             "and its faults may end the process; put its class or function into a module for a "
             "process of its own",
             UserWarning,
         )
-    return *specs, workers
+    return spec
 
 
 def _importable(target: Any) -> str | None:

@@ -23,7 +23,6 @@ from merge_sumo.errors import UserError
 from merge_sumo.files import Files, check_code, hashed
 from merge_sumo.printable import printable
 from merge_sumo.scenario.scenario import DEADLINE_S, MEMORY_GIB
-from merge_sumo.workers import workers_or_cores
 
 BUILT_IN, INSTALLED, PYTHON, HERE = "built-in", "installed", "python", "here"
 WITHOUT_PREFIX = (BUILT_IN, INSTALLED, PYTHON)
@@ -214,20 +213,6 @@ class ControllerKind:
                     "began: let it be while it runs, and let all workers have the same"
                 )
         return self.driver(corridors, simulation)
-
-    def workers(self, requested: int | None) -> int:
-        """Return in how many processes it is tested: the requested ones, or one a core for None.
-
-        Raises `UserError` when more are requested than it can serve, or less than one.
-        """
-        count, most = workers_or_cores(requested), self.max_workers
-        if most is None or count <= most:
-            if count > 1:
-                self.release()
-            return count
-        if requested is None:
-            return most
-        raise UserError(f"`workers` is {requested}: {self.spec} serves at most {most} at a time")
 
     def parameters(self) -> dict[str, float]:
         """Return the parameters that a spec may set, with their present values.

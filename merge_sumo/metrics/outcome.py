@@ -202,7 +202,7 @@ class Episode:
         trajectory: the motion of all vehicles.
         files: hashes of the user's files that the VUT has loaded, by path.
         pov_files: hashes of those that the user's POV has loaded.
-        again: whether the case was retried after the death of a process.
+        ran_again: whether the case was retried after the death of a process.
         in_sumo: whether SUMO ran the case, whichever engine the plan has.
         earlier: the same case with the earlier version, in a campaign against one.
     """
@@ -211,7 +211,7 @@ class Episode:
     trajectory: Trajectory
     files: Files = field(default_factory=dict)
     pov_files: Files = field(default_factory=dict)
-    again: bool = False
+    ran_again: bool = False
     in_sumo: bool = True
     earlier: Episode | None = None
 

@@ -18,9 +18,9 @@ from typing import Self
 import msgspec
 from markupsafe import Markup
 
-from merge_sumo.campaigns.again import again
+from merge_sumo.campaigns.printed_commands import campaign_command
 from merge_sumo.campaigns.recorded import OUTCOMES, RecordedCampaign
-from merge_sumo.campaigns.repeats import read_repeats, unrepeatable
+from merge_sumo.campaigns.repeatability import read_second_runs, unrepeatable
 from merge_sumo.controllers.process import LOG, end_of
 from merge_sumo.drivers.reference import REFERENCES
 from merge_sumo.errors import UserError
@@ -132,7 +132,7 @@ def report_page(run: RecordedCampaign, *, learns: bool = True, running: bool = F
         running: whether the campaign runs: a browser then loads the page again and again.
     """
     model, scenario = ReportModel(run, learns=learns), run.scenario
-    warnings = [unrepeatable(read_repeats(run)), mostly_clipped(run.cases)]
+    warnings = [unrepeatable(read_second_runs(run)), mostly_clipped(run.cases)]
     notes = doubts(run.cases, run.criterion, run.settings.in_vain)
     if run.settings.ran_again:
         notes.append(run.ran_again_in_words)
@@ -150,7 +150,7 @@ def report_page(run: RecordedCampaign, *, learns: bool = True, running: bool = F
         vut=run.vut,
         warnings=filter(None, warnings),
         notes=notes,
-        go_on=again("resume", run.folder, run.record),
+        go_on=campaign_command("resume", run.folder, run.record),
         printed=end_of(run.folder / LOG),
         scenario=scenario,
         level_about=LEVEL_ABOUT,

@@ -10,7 +10,7 @@ from merge_sumo.analysis.counterfactuals import AVOIDANCE
 from merge_sumo.analysis.explanation import EXPLANATIONS
 from merge_sumo.analysis.stress import STRESS
 from merge_sumo.analysis.surface import Surface, learn_surface
-from merge_sumo.campaigns.again import again, call, command
+from merge_sumo.campaigns.printed_commands import call, campaign_command, command
 from merge_sumo.campaigns.recorded import RecordedCampaign, failures, regions_of, spread_failures
 from merge_sumo.errors import UserError
 from merge_sumo.metrics.cause import Diagnosis, FailureBox, Kind, diagnose, failure_boxes
@@ -109,7 +109,7 @@ class ReportModel:
         self.boxes: list[FailureBox] = []
         for level in self.levels:
             self.boxes += failure_boxes(self.worst + self.near, level)
-        explain = again("explain", run.folder, run.record, INDEX)
+        explain = campaign_command("explain", run.folder, run.record, INDEX)
         before, _, after = explain.partition(str(INDEX))
         if explain.startswith("ms."):
             after += f"; {call('report', run.folder)}"

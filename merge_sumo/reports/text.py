@@ -27,7 +27,7 @@ from merge_sumo.analysis.share import SHARES
 from merge_sumo.analysis.stress import StressResult
 from merge_sumo.analysis.truth import DENSE_CASES, REAL_REGION, Truth, TruthResult
 from merge_sumo.analysis.vut_check import VutCheck
-from merge_sumo.campaigns.again import again, command
+from merge_sumo.campaigns.printed_commands import campaign_command, command
 from merge_sumo.campaigns.recorded import RecordedCampaign
 from merge_sumo.drivers.reference import REFERENCES
 from merge_sumo.metrics.cause import cause, conflicting_car
@@ -108,7 +108,7 @@ def headline(run: RecordedCampaign, facts: Sequence[Fact]) -> list[str]:
         contacts = _counted(of[CONTACT], "more case")
         remarks.append(f"contact after the merge in {contacts}: `fail_when` unsafe counts them")
     if not is_measured:
-        measure = again("probability", run.folder, run.record)
+        measure = campaign_command("probability", run.folder, run.record)
         remarks.append(f"{STARTS_THAT_FAIL} are not measured: {measure}")
     if remarks:
         lines.append("; ".join(remarks))
@@ -499,7 +499,7 @@ def explanation(result: ExplanationResult) -> list[str]:
     if found.nearest_start is not None:
         name, value = found.nearest_start
         options["at"] = {name: value}
-        again_here = again("run", run.folder, run.record, outcome.index, **options)
+        again_here = campaign_command("run", run.folder, run.record, outcome.index, **options)
         lines.append(f"look at it: {again_here}")
     return [*lines, f"in the report: {command('report', run.folder)}"]
 

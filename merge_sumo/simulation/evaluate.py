@@ -70,7 +70,7 @@ def simulate_part(
                 trajectories[index],
                 files,
                 pov_files,
-                again=index in simulator.ran_again,
+                ran_again=index in simulator.ran_again,
                 in_sumo=index in simulator.in_sumo,
             )
             parts.append(keep(episode))

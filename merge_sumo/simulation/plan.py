@@ -12,17 +12,19 @@ from pathlib import Path
 from typing import Any
 
 from merge_sumo.controllers.kinds import runs_code
-from merge_sumo.controllers.spec import ControllerKind
+from merge_sumo.controllers.spec import HERE, ControllerKind
 from merge_sumo.errors import UserError
 from merge_sumo.metrics.criterion import Criterion
 from merge_sumo.metrics.measures import MEASURES
 from merge_sumo.road.road import Road
 from merge_sumo.scenario.scenario import OWN, Scenario
 from merge_sumo.simulation.povs import Povs
-from merge_sumo.workers import AnyWorkers
+from merge_sumo.workers import AUTO, AnyWorkers, number_of_workers
 
 MAX_CORRIDORS = 32
 """Episodes that one process runs at a time."""
+FEW = 1000
+"""Cases of built-in drivers that one process runs before others have started and share them."""
 
 
 class Engine(StrEnum):
@@ -54,7 +56,7 @@ class SimulationPlan:
     """Everything that a process needs to run cases; it travels to workers with every chunk.
 
     Example:
-        plan = resolve(CampaignSettings(vut="design2"))
+        plan = CampaignSettings(vut="design2").load_plan()
         episodes = simulate(plan.with_engine("kinematic"), cases)
 
     Attributes:
@@ -168,16 +170,38 @@ class SimulationPlan:
         own = self.povs.own
         return self.vut.asks_sumo or (own is not None and own.asks_sumo)
 
-    def workers(self, requested: AnyWorkers) -> int | str:
-        """Return the number of processes that VUT and POV can serve, or the address of a cluster.
+    def workers(self, requested: AnyWorkers, cases: int | None = None) -> int | str:
+        """Return the number of processes that run cases, or the address of a Dask scheduler.
+
+        Args:
+            requested: the number or the address; None and "auto" for one a core, as far as the
+                controllers can serve them and more than one pays.
+            cases: number of cases of a campaign; None for a study.
 
         Raises:
-            UserError: if more are requested than that.
+            UserError: if more are requested than a controller can serve.
         """
-        if isinstance(requested, str):
+        kinds = [kind for kind in (self.vut, self.against, self.povs.own) if kind is not None]
+        if any(kind.spec.kind == HERE for kind in kinds):
+            return 1
+        if isinstance(requested, str) and requested != AUTO:
             return requested
-        most, own = self.vut.workers(requested), self.povs.own
-        return most if own is None else min(most, own.workers(requested))
+        count, is_auto = number_of_workers(requested), requested in (None, AUTO)
+        if is_auto and self.needs_sumo is None and cases is not None and cases <= FEW:
+            count = 1
+        for kind in kinds:
+            if kind.max_workers is None or count <= kind.max_workers:
+                continue
+            if not is_auto:
+                raise UserError(
+                    f"`workers` is {requested}: {kind.spec} serves at most {kind.max_workers} at a "
+                    "time"
+                )
+            count = kind.max_workers
+        if count > 1:
+            for kind in kinds:
+                kind.release()
+        return count
 
     def for_cases(self, cases: int) -> SimulationPlan:
         """Return the plan with no more corridors than there are cases to run at a time."""

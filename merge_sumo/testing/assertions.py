@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from merge_sumo import api
 from merge_sumo.api import verb
-from merge_sumo.campaigns.again import again, command
+from merge_sumo.campaign_run import CampaignRun
+from merge_sumo.campaigns.printed_commands import campaign_command, command
 from merge_sumo.campaigns.recorded import failures
 from merge_sumo.config import NoFailures
 from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.printable import printable
 from merge_sumo.reports.text import causes
-from merge_sumo.results import CampaignRun
 from merge_sumo.scenario.case import described
 from merge_sumo.scenario.scenario import level_name
 
@@ -50,5 +50,5 @@ def _worst(run: CampaignRun, outcome: Outcome, title: str) -> list[str]:
         f"  {title}: case {index}, POV level {level_name(case.level)}, {described(case)}",
         f"    {causes(run.recorded, [outcome])[index]}",
         f"    replay it: {command('replay', run.folder, index, gui=True)}",
-        f"    run it again: {again('run', run.folder, run.settings, index)}",
+        f"    run it again: {campaign_command('run', run.folder, run.settings, index)}",
     ]

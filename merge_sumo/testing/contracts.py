@@ -19,7 +19,6 @@ import numpy as np
 
 from merge_sumo import api
 from merge_sumo.campaigns.campaign import run_campaign
-from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.recorded import RecordedCampaign
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.controllers.kinds import load
@@ -110,7 +109,7 @@ def campaign_of(vut: str = "level0", scenario: Scenario = US23) -> RecordedCampa
         scenario=scenario,
         fail_when=scenario.criterion,
     )
-    return run_campaign(settings, resolve(settings), folder)
+    return run_campaign(settings, settings.load_plan(), folder)
 
 
 class VutContract:

@@ -21,9 +21,8 @@ from merge_sumo.analysis.comparison import Change, ComparedCase, compare
 from merge_sumo.analysis.rerun import rerun
 from merge_sumo.analysis.run_study import RunStudy
 from merge_sumo.campaigns.journal import Journal
-from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.recorded import RecordedCampaign
-from merge_sumo.campaigns.settings import settings_of
+from merge_sumo.campaigns.settings import settings_from_folder
 from merge_sumo.errors import UserError
 from merge_sumo.metrics.measures import Measures
 from merge_sumo.metrics.outcome import Episode, Outcome
@@ -245,6 +244,6 @@ def test_campaigns_with_repeats_are_compared_case_by_case(tmp_path):
         # The same seeds: what stops below .3 stops below .4, too.
         assert one.earlier_runs.failures <= one.later_runs.failures
     assert version_change.count(Change.BROKE) == 0, "no case is told apart by ten runs"
-    today = settings_of(made[0].folder, made[0].record, {"vut": made[0].vut})
-    again = rerun(RunStudy(made[0], today, resolve(today)), made[0].outcomes)
+    today = settings_from_folder(made[0].folder, made[0].record, {"vut": made[0].vut})
+    again = rerun(RunStudy(made[0], today, today.load_plan()), made[0].outcomes)
     assert {case.change for case in again.version_changes[0].cases} <= {Change.BOTH, Change.NEITHER}

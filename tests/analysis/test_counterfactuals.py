@@ -15,9 +15,8 @@ from support.scenes import scene_of
 
 from merge_sumo.analysis.counterfactuals import AVOIDANCE, avoidances, write_avoidance
 from merge_sumo.analysis.run_study import RunStudy
-from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.recorded import RecordedCampaign, failures
-from merge_sumo.campaigns.settings import CampaignSettings, controllers, settings_of
+from merge_sumo.campaigns.settings import CampaignSettings, controllers, settings_from_folder
 from merge_sumo.controllers.spec import ControllerOptions
 from merge_sumo.drivers.policies import policies_of
 from merge_sumo.drivers.reference import REFERENCES, CarefulPov
@@ -32,8 +31,8 @@ from merge_sumo.simulation.povs import Povs, own_pov
 @pytest.fixture(scope="module")
 def found(run, tmp_path_factory):
     copy = RecordedCampaign(shutil.copytree(run.folder, tmp_path_factory.mktemp("found") / "run"))
-    settings = settings_of(copy.folder, copy.record, controllers(copy.record))
-    found = write_avoidance(RunStudy(copy, settings, resolve(settings)))
+    settings = settings_from_folder(copy.folder, copy.record, controllers(copy.record))
+    found = write_avoidance(RunStudy(copy, settings, settings.load_plan()))
     assert AVOIDANCE.read_lines(copy) == found
     return found
 
@@ -98,7 +97,7 @@ def test_on_a_lane_it_names_the_drivers_that_pass_as_the_vut(tmp_path):
         fail_when="unsafe",
     )
     run = run_campaign(settings, tmp_path / "run")
-    plan = resolve(settings).with_engine("kinematic")
+    plan = settings.load_plan().with_engine("kinematic")
     failing = [o for o in run.outcomes if o.failed]
     found = avoidances(plan, [(o.index, run.trajectory(o.index)) for o in failing])
     for name in REFERENCES:

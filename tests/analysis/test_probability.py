@@ -29,8 +29,7 @@ from merge_sumo.analysis.probability import (
 )
 from merge_sumo.analysis.probability import failure_probability as failure_probability_of
 from merge_sumo.analysis.run_study import RunStudy
-from merge_sumo.campaigns.plan import resolve
-from merge_sumo.campaigns.settings import settings_of
+from merge_sumo.campaigns.settings import settings_from_folder
 from merge_sumo.errors import UserError
 from merge_sumo.metrics.summary import clopper_pearson
 from merge_sumo.road.scenario_file import named_scenario
@@ -195,8 +194,8 @@ class TestATraffic:
 
 
 def failure_probability(run, out, engine="kinematic", **other):
-    settings = settings_of(run.folder, run.record)
-    study = RunStudy(run, settings, resolve(settings).with_engine(engine))
+    settings = settings_from_folder(run.folder, run.record)
+    study = RunStudy(run, settings, settings.load_plan().with_engine(engine))
     return failure_probability_of(study, config.Probability(run, **other), out)
 
 

@@ -14,7 +14,6 @@ from merge_sumo import api
 from merge_sumo.analysis import share
 from merge_sumo.analysis.run_study import RunStudy, end_of
 from merge_sumo.analysis.share import SHARES, LevelShare, uniform_cases, write_shares
-from merge_sumo.campaigns.plan import resolve
 from merge_sumo.simulation.evaluate import evaluate, simulate_part
 
 
@@ -38,7 +37,7 @@ def test_of_a_campaign_holds_the_share_of_many_more_starts(tmp_path, monkeypatch
     shares = SHARES.read(run.folder)
     assert shares is not None
     [level] = shares.levels
-    plan = resolve(campaign_settings(vut="design1")).with_engine(None)
+    plan = campaign_settings(vut="design1").load_plan().with_engine(None)
     points = np.random.default_rng(99).random((5000, 2))
     pool = campaign_settings(vut="design1").pool
     many = evaluate(plan, pool.cases(points, 0), None, end_of)
@@ -78,7 +77,7 @@ def test_of_a_controller_of_the_user_is_measured_too():
     run = api.campaign("own.py:Own", level="0,1", seed=4, cases=10, out="run", progress=False)
     shares = SHARES.read(run.folder)
     assert shares is not None
-    plan = resolve(campaign_settings(vut="own.py:Own", levels=(0, 1)))
+    plan = campaign_settings(vut="own.py:Own", levels=(0, 1)).load_plan()
     for level, one in enumerate(shares.levels):
         assert one.cases == 200
         cases = uniform_cases(plan.scenario, level, 200, seed=4)
@@ -110,7 +109,7 @@ def test_runs_a_fifth_of_the_cases_of_a_large_campaign(monkeypatch):
     monkeypatch.setattr(
         share, "evaluate", lambda _plan, cases, *_: [(True, True, True)] * len(cases)
     )
-    write_shares(RunStudy(run, settings, resolve(settings)))
+    write_shares(RunStudy(run, settings, settings.load_plan()))
     assert SHARES.read(run.folder).levels == tuple(LevelShare(k, 240, 240) for k in (0, 1))
 
 

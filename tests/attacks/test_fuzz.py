@@ -17,7 +17,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from merge_sumo.campaigns.recorded import OUTCOMES, SETTINGS, TRAJECTORIES, RecordedCampaign
-from merge_sumo.campaigns.settings import settings_of
+from merge_sumo.campaigns.settings import settings_from_folder
 from merge_sumo.drivers.policies import load_network, read_manifest
 from merge_sumo.errors import UserError
 from merge_sumo.files import resource
@@ -54,7 +54,7 @@ def spoilt(draw: Any, original: bytes) -> bytes:
 
 def read_settings(folder: Path) -> None:
     run = RecordedCampaign(folder)
-    settings_of(run.folder, run.record)
+    settings_from_folder(run.folder, run.record)
 
 
 def read_policies(folder: Path) -> None:

@@ -112,7 +112,7 @@ class TestAJournal:
             assert again.case == ran[index].trajectory.case
 
     def test_notes_what_episodes_tell_of_the_settings(self, tmp_path):
-        first = replace(episode(0), files={"a": "2", "b": "3"}, again=True)
+        first = replace(episode(0), files={"a": "2", "b": "3"}, ran_again=True)
         second = replace(episode(1, 1), pov_files={"c": "4"})
         with Journal.create(tmp_path / "run", {"vut_files": {"a": "1"}, "pov_files": None}) as to:
             for one, in_vain in ((first, ("a", "b")), (second, ("a",))):

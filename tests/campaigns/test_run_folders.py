@@ -14,7 +14,7 @@ from conftest import require
 from support.calling import assert_refused
 from support.campaigning import campaign_settings, run_campaign
 
-from merge_sumo.campaigns.again import again
+from merge_sumo.campaigns.printed_commands import campaign_command
 from merge_sumo.campaigns.recorded import OUTCOMES, RecordedCampaign, read_settings
 from merge_sumo.controllers.in_memory import names_code
 from merge_sumo.controllers.kinds import load
@@ -117,7 +117,7 @@ class TestARunFolder:
             ran(mine)
             assert_refused(command_line("campaign", "--resume", name, "-q"), f"again with --{name}")
             assert not ran(mine)
-            words = shlex.split(again("rerun", Path(name), read_settings(Path(name)), 0))
+            words = shlex.split(campaign_command("rerun", Path(name), read_settings(Path(name)), 0))
             assert command_line(*words[1:], "-q")[0] == 0
 
 

@@ -87,7 +87,7 @@ class TestOptions:
             raise UserError("enough")
 
         monkeypatch.setattr(ms, "truth", truth)
-        for words, workers in ((), None), (("--workers", "2"), 2), (("--workers", "auto"), None):
+        for words, workers in ((), "auto"), (("--workers", "2"), 2):
             invoke("truth", "design1", *words)
             assert seen["workers"] == workers
         assert config.GroundTruth("design1").workers == 1

@@ -21,7 +21,7 @@ from support.campaigning import campaign_settings, run_campaign
 
 import merge_sumo as ms
 from merge_sumo import testing
-from merge_sumo.campaigns.again import again, command
+from merge_sumo.campaigns.printed_commands import campaign_command, command
 from merge_sumo.errors import Notice
 from merge_sumo.interrupt import Stopped
 from merge_sumo.road.scenario_file import to_toml
@@ -115,7 +115,7 @@ def printed(vut: str, command_line: Call, *options: object) -> set[str]:
     found |= on_page
     for line in (
         explain.split(" && ")[0],
-        again("rerun", run.folder, run.settings, [worst]),
+        campaign_command("rerun", run.folder, run.settings, [worst]),
         f"merge-sumo rerun {shlex.quote(RUN)} 0 1 2 --vut fsm -q",
     ):
         said = command_line(*shlex.split(line)[1:])
@@ -131,7 +131,7 @@ def printed(vut: str, command_line: Call, *options: object) -> set[str]:
     resume = set(commands_in("\n".join(raised.value.__notes__)))
     ms.report("stopped")
     assert resume == {c for c in commands_on(Path("stopped", "report.html"), 0) if "--resume" in c}
-    return found | resume | {again("run", run.folder, run.settings, worst)}
+    return found | resume | {campaign_command("run", run.folder, run.settings, worst)}
 
 
 @pytest.mark.parametrize(
@@ -160,7 +160,7 @@ def test_runs_of_an_object_of_a_notebook(place):
     assert f'ms.explain("{RUN}", {worst}, vut=MyVut); ms.report("{RUN}")' in found
     explained = ms.explain(run, worst, vut=here, progress=False)
     found |= set(commands_in("\n".join(explained.lines())))
-    found |= {again("run", run.folder, run.settings, worst, at={"x_pov0_m": -250.0})}
+    found |= {campaign_command("run", run.folder, run.settings, worst, at={"x_pov0_m": -250.0})}
     calls = {one for one in found if one.startswith("ms.")}
     assert len(calls) >= 3
     assert not any("here:" in one for one in found)

@@ -14,12 +14,12 @@ from support.calling import invoke
 from support.handmade import write_run
 
 from merge_sumo.analysis.counterfactuals import AVOIDANCE, Avoidance
+from merge_sumo.campaign_run import CampaignRun
 from merge_sumo.campaigns.recorded import RecordedCampaign, failures
 from merge_sumo.reports import report_model
 from merge_sumo.reports.facts import CONTACT, Fact
 from merge_sumo.reports.report import report_page
 from merge_sumo.reports.text import headline
-from merge_sumo.results import CampaignRun
 
 
 @pytest.fixture(scope="module")

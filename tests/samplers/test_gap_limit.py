@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from merge_sumo.campaigns.campaign import controller_model_of
-from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.metrics.criterion import PAPER
 from merge_sumo.metrics.regression import regression
@@ -36,7 +35,7 @@ def searched(limit_m: float, fail_when: str, cases: int, vut: str = "level0"):
         vut=vut, levels=(0,), cases=cases, scenario=scenario, fail_when=fail_when
     )
     points = np.random.default_rng(7).random((cases, 2))
-    plan = resolve(settings).with_engine("kinematic")
+    plan = settings.load_plan().with_engine("kinematic")
     ran = simulate(plan, settings.pool.cases(points, 0))
     outcomes = [one.at(place, 0).outcome for place, one in enumerate(ran)]
     return (

@@ -7,9 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from merge_sumo.campaigns import campaign
-from merge_sumo.campaigns.plan import resolve
 from merge_sumo.campaigns.recorded import RecordedCampaign, read_settings
-from merge_sumo.campaigns.settings import CampaignSettings, controllers, settings_of
+from merge_sumo.campaigns.settings import CampaignSettings, controllers, settings_from_folder
 from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.scenario.scenario import US23
 
@@ -31,7 +30,7 @@ def run_campaign(
             on_case(outcome)
 
     callbacks = (on_cases, *other.pop("callbacks", ()))
-    return campaign.run_campaign(settings, resolve(settings), folder, callbacks, **other)
+    return campaign.run_campaign(settings, settings.load_plan(), folder, callbacks, **other)
 
 
 def resume_campaign(
@@ -40,5 +39,5 @@ def resume_campaign(
     """Go on with a campaign, with its controllers named again as they were."""
     recorded = read_settings(folder)
     named = {**controllers(recorded), **(given or {})}
-    settings = settings_of(folder, recorded, named, resumes=True)
-    return campaign.run_campaign(settings, resolve(settings), folder, resumes=True, **other)
+    settings = settings_from_folder(folder, recorded, named, resumes=True)
+    return campaign.run_campaign(settings, settings.load_plan(), folder, resumes=True, **other)

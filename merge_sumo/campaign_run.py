@@ -12,7 +12,7 @@ from merge_sumo.analysis.cases_file import CasesFile
 from merge_sumo.analysis.comparison import Change, Comparison, compare_against
 from merge_sumo.analysis.share import SHARES
 from merge_sumo.campaigns.recorded import AGAINST, NAME_CHARACTERS, RecordedCampaign, failures
-from merge_sumo.campaigns.repeats import Repeat, read_repeats, unrepeatable
+from merge_sumo.campaigns.repeatability import SecondRun, read_second_runs, unrepeatable
 from merge_sumo.config import AnyRun
 from merge_sumo.metrics.cause import cause
 from merge_sumo.metrics.measures import Measures
@@ -111,9 +111,9 @@ class CampaignRun(Result):
         return Table(o for o in self.recorded.outcomes if o.measures.end is End.TIMEOUT)
 
     @cached_property
-    def repeats(self) -> list[Repeat]:
+    def repeats(self) -> list[SecondRun]:
         """The cases that ran a second time, and whether they went as before."""
-        return read_repeats(self.recorded)
+        return read_second_runs(self.recorded)
 
     @cached_property
     def summary(self) -> Summary:
@@ -293,7 +293,7 @@ def campaign_of(run: AnyRun) -> CampaignRun:
     return run if isinstance(run, CampaignRun) else CampaignRun(folder_of(run))
 
 
-def recorded(run: AnyRun) -> RecordedCampaign:
+def open_recorded(run: AnyRun) -> RecordedCampaign:
     """Open a campaign, or a cases file."""
     path = folder_of(run)
     is_file = not path.is_dir() and (path.suffix == SUFFIX or path.exists())

@@ -37,8 +37,8 @@ ONE_IN: Final = 8
 """One case of this number runs twice, up to the maximum."""
 
 
-class Repeat(Record, frozen=True, forbid_unknown_fields=False):
-    """A case that ran a second time; lines of earlier versions have more keys.
+class SecondRun(Record, frozen=True, forbid_unknown_fields=False):
+    """How the second run of a case compares with the first; older lines have more keys.
 
     Attributes:
         index: of the case.
@@ -62,9 +62,9 @@ class Repeat(Record, frozen=True, forbid_unknown_fields=False):
         return self.differs_from_s is None and not self.other_verdict
 
 
-def repeat(
+def check_repeatability(
     run: RecordedCampaign, settings: CampaignSettings, plan: SimulationPlan, workers: Workers
-) -> list[Repeat]:
+) -> list[SecondRun]:
     """Run some cases of a campaign again, and write the comparison to `repeats.jsonl`.
 
     Cases that end in an error now are left out.
@@ -78,7 +78,7 @@ def repeat(
     Returns:
         A comparison for each case, by index.
     """
-    chosen = chosen_again(run.outcomes, settings)
+    chosen = cases_to_repeat(run.outcomes, settings)
     if not chosen:
         return []
     found = []
@@ -88,29 +88,28 @@ def repeat(
     )
     for outcome, ran in zip(chosen, workers.collect(job), strict=True):
         if not ran.outcome.measures.end.is_error:  # of a slow machine, perhaps
-            found.append(repeat_of(outcome, run.trajectory(outcome.index), ran))
+            found.append(second_run_of(outcome, run.trajectory(outcome.index), ran))
     found.sort(key=lambda one: one.index)
     replace_own(run.folder / REPEATS, b"".join(map(to_json, found)), b'"index"')
     return found
 
 
-def chosen_again(outcomes: Sequence[Outcome], settings: CampaignSettings) -> list[Outcome]:
+def cases_to_repeat(outcomes: Sequence[Outcome], settings: CampaignSettings) -> list[Outcome]:
     """Return the outcomes of the cases that are to run again, in that order.
 
-    Only those of `others_drive`. Half are the first cases, which a new controller ran; the others
+    Only those of `may_not_repeat`. Half are the first cases, which a new controller ran; the others
     are spread over the campaign, and run before those. Errors may be a slow machine's doing, and
     are left out.
     """
-    tested = [
-        outcome for outcome in others_drive(outcomes, settings) if not outcome.measures.end.is_error
-    ]
+    candidates = may_not_repeat(outcomes, settings)
+    tested = [outcome for outcome in candidates if not outcome.measures.end.is_error]
     count = min(MOST, -(-len(tested) // ONE_IN))
     first = (count + 1) // 2
     others = np.linspace(len(tested) - 1, first, count - first).astype(np.int64).tolist()
     return [tested[place] for place in (*others, *reversed(range(first)))]
 
 
-def others_drive(outcomes: Iterable[Outcome], settings: CampaignSettings) -> list[Outcome]:
+def may_not_repeat(outcomes: Iterable[Outcome], settings: CampaignSettings) -> list[Outcome]:
     """Return the outcomes of the cases in which something drives that may not repeat itself.
 
     A TraCI client that a user starts has none: it may have ended.
@@ -122,7 +121,7 @@ def others_drive(outcomes: Iterable[Outcome], settings: CampaignSettings) -> lis
     return [one for one in outcomes if own_vut or (own_pov and one.case.level == OWN)]
 
 
-def repeat_of(outcome: Outcome, recorded: Trajectory, ran: Episode) -> Repeat:
+def second_run_of(outcome: Outcome, recorded: Trajectory, ran: Episode) -> SecondRun:
     """Return how the second run of a case compares with the first one.
 
     Args:
@@ -134,7 +133,7 @@ def repeat_of(outcome: Outcome, recorded: Trajectory, ran: Episode) -> Repeat:
     now = ran.outcome
     end = now.measures.end
     other = (end, now.failed) != (outcome.measures.end, outcome.failed)
-    return Repeat(outcome.index, differs_from_s, first, end, now.failed, other)
+    return SecondRun(outcome.index, differs_from_s, first, end, now.failed, other)
 
 
 def _difference(one: Trajectory, other: Trajectory) -> tuple[float | None, Vehicle | None]:
@@ -154,12 +153,12 @@ def _difference(one: Trajectory, other: Trajectory) -> tuple[float | None, Vehic
     return (None if same else round((rows - 1) * DT_S, 1)), None
 
 
-def read_repeats(run: RecordedCampaign) -> list[Repeat]:
+def read_second_runs(run: RecordedCampaign) -> list[SecondRun]:
     """Read the comparisons of a campaign; `UserError` for a wrong line."""
-    return read_indexed(run.folder / REPEATS, Repeat, range(len(run.outcomes)))
+    return read_indexed(run.folder / REPEATS, SecondRun, range(len(run.outcomes)))
 
 
-def unrepeatable(found: Iterable[Repeat]) -> str | None:
+def unrepeatable(found: Iterable[SecondRun]) -> str | None:
     """Return a sentence on the cases that did not repeat; None where each did."""
     known = list(found)
     differing = [one for one in known if not one.same]

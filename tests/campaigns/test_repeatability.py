@@ -8,11 +8,11 @@ from support.campaigning import campaign_settings
 
 import merge_sumo as ms
 from merge_sumo.campaigns.recorded import RecordedCampaign
-from merge_sumo.campaigns.repeats import (
+from merge_sumo.campaigns.repeatability import (
     REPEATS,
-    Repeat,
-    chosen_again,
-    read_repeats,
+    SecondRun,
+    cases_to_repeat,
+    read_second_runs,
     unrepeatable,
 )
 from merge_sumo.errors import UserError
@@ -41,7 +41,7 @@ def test_a_controller_that_remembers_is_named_everywhere(write_vut, tmp_path):
     assert done.stdout.startswith("Not repeatable: ")
     run = RecordedCampaign(folder)
     assert len(run.outcomes) == 60
-    repeats = read_repeats(run)
+    repeats = read_second_runs(run)
     assert len(repeats) == 8
     assert [one.index for one in repeats[:4]] == list(range(4))
     differing = [one for one in repeats if not one.same]
@@ -59,22 +59,22 @@ def test_a_controller_that_remembers_is_named_everywhere(write_vut, tmp_path):
 
 
 def test_drivers_of_the_package_and_clients_that_a_user_starts_run_once(run):
-    assert read_repeats(run) == []
+    assert read_second_runs(run) == []
     assert not (run.folder / REPEATS).exists()
-    assert chosen_again(run.outcomes, campaign_settings(vut="design1")) == []
+    assert cases_to_repeat(run.outcomes, campaign_settings(vut="design1")) == []
     settings = campaign_settings(vut="traci")
-    assert chosen_again(run.outcomes, settings) == []
+    assert cases_to_repeat(run.outcomes, settings) == []
     started = campaign_settings(vut="traci:python3 client.py {port}")
-    assert len(chosen_again(run.outcomes, started)) == 8
+    assert len(cases_to_repeat(run.outcomes, started)) == 8
 
 
 def test_a_changed_file_is_refused_by_its_line(run, tmp_path):
     for name in ("campaign.json", "outcomes.jsonl"):
         (tmp_path / name).write_bytes((run.folder / name).read_bytes())
-    opened, repeat = RecordedCampaign(tmp_path), Repeat(3, 1.5, "vut", End.MERGED, False, True)
+    opened, repeat = RecordedCampaign(tmp_path), SecondRun(3, 1.5, "vut", End.MERGED, False, True)
     line = to_json(repeat)
     (tmp_path / REPEATS).write_bytes(line)
-    assert read_repeats(opened) == [repeat]
+    assert read_second_runs(opened) == [repeat]
     (tmp_path / REPEATS).write_bytes(line + line.replace(b"vut", b"<script>"))
     with pytest.raises(UserError, match=r"line 2 of .*repeats.jsonl is not as it was written"):
-        read_repeats(opened)
+        read_second_runs(opened)

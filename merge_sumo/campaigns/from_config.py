@@ -1,7 +1,4 @@
-"""From the config of a verb to the settings of a campaign, and to the plan of its simulation.
-
-A single case, with the same drivers and verdict as in a campaign, is planned here as well.
-"""
+"""From the config of a verb to the settings of a campaign, or of a single case."""
 
 from __future__ import annotations
 
@@ -12,55 +9,19 @@ from pathlib import Path
 from typing import Any
 
 from merge_sumo import config as c
+from merge_sumo.campaigns.printed_commands import CONTROLLERS
 from merge_sumo.campaigns.recorded import RecordedCampaign
-from merge_sumo.campaigns.settings import CampaignSettings, settings_of
-from merge_sumo.controllers.in_memory import AnyVut, drivers_of
-from merge_sumo.controllers.kinds import load
+from merge_sumo.campaigns.settings import CampaignSettings, settings_from_folder
+from merge_sumo.controllers.in_memory import spec_of_driver
 from merge_sumo.errors import UserError
-from merge_sumo.road.loader import road_for
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.scenario.case import Case
 from merge_sumo.scenario.imperfection import Actuation, Sensing
 from merge_sumo.scenario.scenario import US23, Scenario, level_name
-from merge_sumo.simulation.plan import SimulationPlan
-from merge_sumo.simulation.povs import Povs, one_level, own_pov, parse_levels, policies_folder
-
-DEBUG_DEADLINE_S = 86_400.0
-"""Deadline of a step while a user debugs."""
+from merge_sumo.simulation.povs import one_level, parse_levels, policies_folder
 
 
-def resolve(settings: CampaignSettings, *, debug: bool = False) -> SimulationPlan:
-    """Return the plan of what settings name: road, drivers, criterion.
-
-    A verb calls it once: it reads files and loads the controllers.
-
-    Args:
-        settings: the settings.
-        debug: whether a controller of the user's runs in this process, without a deadline.
-
-    Raises:
-        UserError: drivers, policies or a road are missing or cannot be loaded.
-    """
-    policies = policies_folder(settings.policies, settings.scenario)
-    options = settings.vut_options(policies)
-    if debug:
-        options = replace(options, in_process=True, deadline_s=DEBUG_DEADLINE_S)
-    vut = load(settings.vut, options)
-    own = None if settings.pov is None else own_pov(settings.pov, options)
-    povs = Povs(policies=policies, own=own)
-    for level in settings.levels:
-        povs.check_level(level)
-    return SimulationPlan(
-        scenario=settings.scenario,
-        road=road_for(settings.scenario),
-        vut=vut,
-        against=None if settings.against is None else load(settings.against, options),
-        povs=povs,
-        criterion=settings.criterion,
-    )
-
-
-def changed_scenario(
+def scenario_from(
     scenario: Scenario | Path | str, changes: Mapping[str, Any] | None = None
 ) -> Scenario:
     """Return the scenario of a config, with changes by the fields of `ScenarioChanges`."""
@@ -72,70 +33,59 @@ def changed_scenario(
     return replace(named, **values) if values else named
 
 
-def explicit(
-    config: c.Drivers,
-    vut: AnyVut = "",
-    pov: AnyVut | None = None,
-    scenario: Scenario | None = None,
-) -> tuple[dict[str, Any], c.Execution]:
-    """Return the settings that a config names, and where its cases run.
+def named_settings(config: c.Drivers, scenario: Scenario | None = None) -> dict[str, Any]:
+    """Return the settings that a config names, by the fields of `CampaignSettings`.
 
     Args:
         config: the config.
-        vut: the recorded VUT, where an object drives again.
-        pov: the recorded POV.
-        scenario: the scenario of a config that names none; None for that of the recorded campaign.
+        scenario: the scenario of a config that names none; None for that of a recorded campaign.
 
     Raises:
         UserError: for a change of a scenario that is not named.
     """
-    named: AnyVut | None = getattr(config, "vut", None)
-    where = config if isinstance(config, c.Execution) else c.Execution()
-    spec, pov_spec, workers = drivers_of(named or vut, config.pov or pov, where.workers)
-    fields = c.changed(config, c.Limits)
-    if named is not None:
-        fields["vut"] = spec
-    if config.pov is not None:
-        fields["pov"] = pov_spec
+    named = c.non_defaults(config, c.Limits)
+    for name in CONTROLLERS:
+        if (controller := getattr(config, name, None)) is not None:
+            named[name] = spec_of_driver(controller)
     if config.policies is not None:
-        fields["policies"] = str(config.policies)
+        named["policies"] = str(config.policies)
     if isinstance(config, c.Test):
-        fields |= c.changed(config, c.FailureRule)
-        changes = c.changed(config, c.ScenarioChanges)
+        named |= c.non_defaults(config, c.FailureRule)
+        changes = c.non_defaults(config, c.ScenarioChanges)
         if base := config.scenario or scenario:
-            fields["scenario"] = changed_scenario(base, changes)
+            named["scenario"] = scenario_from(base, changes)
         elif changes:
             (name, *_) = changes
             raise UserError(f"`{name}` is of the scenario: name that, too, with `scenario`")
     if isinstance(config, c.CampaignCalls):
-        fields |= c.changed(config, c.Search)
-        if config.against is not None:
-            fields["against"], _, workers = drivers_of(config.against, None, workers)
+        named |= c.non_defaults(config, c.Search)
         if config.cases is not None:
-            fields["stop_when_converged"] = config.stop_when_converged
-    return fields, c.Execution(workers=workers, progress=where.progress)
+            named["stop_when_converged"] = config.stop_when_converged
+    return named
 
 
-def settings_for(
+def settings_from_config(
     config: c.Campaign | c.GroundTruth | c.Benchmark, **search: Any
-) -> tuple[CampaignSettings, c.Execution]:
-    """Return the settings of a campaign, or of a study, and where it runs.
+) -> CampaignSettings:
+    """Return the settings of a campaign, or of a study.
 
-    `search` has settings that the study chooses.
+    Args:
+        config: the config.
+        search: settings that the study chooses.
     """
-    fields, where = explicit(config, scenario=US23)
+    named = named_settings(config, US23)
     if isinstance(config, c.Campaign) and config.cases is None:
-        fields["stop_when_converged"] = True
-    folder = policies_folder(config.policies, fields["scenario"])
-    fields["levels"] = parse_levels(config.level, folder, own=config.pov is not None)
-    return _new_settings(fields | search), where
+        named["stop_when_converged"] = True
+    folder = policies_folder(config.policies, named["scenario"])
+    named["levels"] = parse_levels(config.level, folder, own=config.pov is not None)
+    return _new_settings(named | search)
 
 
-def _new_settings(fields: dict[str, Any]) -> CampaignSettings:
+def _new_settings(named: dict[str, Any]) -> CampaignSettings:
     """Return settings whose failures are those of the scenario, where nothing else is named."""
-    if "require" not in fields:
-        fields.setdefault("fail_when", fields["scenario"].criterion)
-    return CampaignSettings(**fields)
+    if "require" not in named:
+        named.setdefault("fail_when", named["scenario"].criterion)
+    return CampaignSettings(**named)
 
 
 ONE: dict[str, Any] = {
@@ -160,18 +110,18 @@ def planned_case(config: c.RunCase, run: RecordedCampaign | None) -> tuple[Campa
     """
     if run is None and not config.vut:
         raise UserError("say with `vut` who drives, or with `recorded` which case of a campaign")
-    fields, _ = explicit(config, scenario=US23 if run is None else None)
+    named = named_settings(config, US23 if run is None else None)
     if run is None or config.recorded is None:
-        scenario, row = fields["scenario"], config.case or {}
+        scenario, row = named["scenario"], config.case or {}
     else:
         scenario, row = run.scenario, run.outcome(config.recorded[1]).to_record()
     level = int(row.get("level", 0))
     if config.level is not None:
         folder = policies_folder(config.policies, scenario)
         level = one_level(str(config.level), folder, own=config.pov is not None)
-    fields |= {**ONE, "levels": (level,)}
-    settings = None if run is None else settings_of(run.folder, run.record, fields)
-    settings = settings or _new_settings(fields)
+    named |= {**ONE, "levels": (level,)}
+    settings = None if run is None else settings_from_folder(run.folder, run.record, named)
+    settings = settings or _new_settings(named)
     draw = _number("draw", row.get("draw") or 0)
     values = {}
     for dimension in settings.scenario.dimensions(level):

@@ -27,7 +27,7 @@ OPTIONS = {"run": ("run", "case"), "resume": ("campaign", "resume")}
 Argument = str | Path | int | float | Sequence[int | str] | Mapping[str, float]
 
 
-def again(
+def campaign_command(
     verb: str,
     folder: Path,
     record: Mapping[str, Any],
@@ -46,7 +46,7 @@ def again(
     named: dict[str, Argument | None] = {}
     for name in CONTROLLERS:
         spec = record.get(name)
-        # A run folder names no code to run; see `settings_of`. Only a campaign has two versions.
+        # `settings_from_folder` asks for code again. Only a campaign has two versions.
         if isinstance(spec, str) and runs_code(spec) and (name != "against" or verb == "resume"):
             named[name] = spec
     return command(verb, folder, *arguments, **{**named, **options})
