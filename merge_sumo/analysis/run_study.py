@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
+from numbers import Integral
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
@@ -27,8 +28,11 @@ R = TypeVar("R", bound=Record)
 class StudyFile(Generic[R]):
     """A file of a campaign: JSON with one record, or a line for each of some failures.
 
+    Example:
+        shares = SHARES.read(run.folder)
+
     Attributes:
-        name: of the file.
+        name: name of the file.
         kind: type of the record, or of a line, which has an `index`.
     """
 
@@ -41,24 +45,55 @@ class StudyFile(Generic[R]):
         return f'"{self.kind.__struct_fields__[0]}"'.encode()
 
     def check(self, folder: Path) -> None:
-        """Raise `UserError` where a file of this name was not created by merge-sumo."""
+        """Check that a study may write the file.
+
+        Args:
+            folder: folder of the campaign.
+
+        Raises:
+            UserError: where a file of this name was not created by merge-sumo.
+        """
         check_generated(folder / self.name, self._mark)
 
     def read(self, folder: Path) -> R | None:
-        """Read the record; None without the file, `UserError` where it is not as it was written."""
+        """Read the record; None without the file.
+
+        Args:
+            folder: folder of the campaign.
+
+        Raises:
+            UserError: where the file is not as it was written.
+        """
         return read_record(folder / self.name, self.kind)
 
     def write(self, folder: Path, record: R) -> None:
-        """Write the record, in the place of an older one."""
+        """Write the record, in the place of an older one.
+
+        Args:
+            folder: folder of the campaign.
+            record: the record.
+        """
         replace_own(folder / self.name, to_json(record, indent=1), self._mark)
 
     def read_lines(self, run: RecordedCampaign) -> list[R]:
-        """Read the lines; `UserError` for one that is not of a failure of the campaign."""
+        """Read the lines; none without the file.
+
+        Args:
+            run: the campaign.
+
+        Raises:
+            UserError: for a line that is not of a failure of the campaign.
+        """
         failing = {outcome.index for outcome in run.outcomes if outcome.failed}
         return read_indexed(run.folder / self.name, self.kind, failing)
 
     def write_lines(self, folder: Path, lines: Iterable[R]) -> None:
-        """Write lines, in the place of older ones."""
+        """Write lines, in the place of older ones.
+
+        Args:
+            folder: folder of the campaign.
+            lines: the lines, in their order.
+        """
         replace_own(folder / self.name, b"".join(map(to_json, lines)), self._mark)
 
 
@@ -69,15 +104,27 @@ OnPart = Callable[[str, int, int, str, str], None]
 
 
 def check_least(options: object, **least: int) -> None:
-    """Raise `UserError` for an option, by its name, that is less than the least."""
+    """Check options that are whole numbers.
+
+    Args:
+        options: options of a verb; None for one of them is its default.
+        least: the least value of an option, by its name.
+
+    Raises:
+        UserError: for an option that is less, or no whole number.
+    """
     for name, number in least.items():
         value = getattr(options, name)
-        if value is not None and value < number:
-            raise UserError(f"`{name}` is {value}: it must be {number} or more")
+        if value is not None and (not isinstance(value, Integral) or value < number):
+            raise UserError(f"`{name}` is {value!r}: it must be a whole number, {number} or more")
 
 
 def end_of(episode: Episode) -> tuple[bool, bool, bool]:
-    """Return whether a case failed, has a verdict, and ran in SUMO."""
+    """Return whether a case failed, has a verdict, and ran in SUMO.
+
+    Args:
+        episode: the episode of the case.
+    """
     return episode.outcome.failed, episode.outcome.is_tested, episode.in_sumo
 
 
@@ -94,7 +141,7 @@ class RunStudy:
         settings: those of the campaign, except for policies that are elsewhere and how a VUT is
             hosted.
         plan: that of the settings, with the engine of the study.
-        workers: where cases run, by default in this process; they decide no result.
+        workers: where cases run, by default in this process; no result depends on them.
         on_cases: called with the number of cases that have just ended.
     """
 
@@ -107,12 +154,15 @@ class RunStudy:
     def simulate(
         self, plan: SimulationPlan, cases: Sequence[Case], keep: Callable[[Episode], T]
     ) -> list[T]:
-        """Run cases; return the kept part of each, in order.
+        """Run cases, and count them as ended.
 
         Args:
             plan: that of the study, or with changes.
             cases: cases of the plan's scenario.
-            keep: returns the part of an episode that is kept; a function with a name.
+            keep: returns the part of an episode that is kept; a function of a module.
+
+        Returns:
+            The kept part of each episode, in the order of the cases.
         """
         results = []
         for result in evaluate(plan, cases, self.workers, keep):
@@ -125,9 +175,13 @@ class RunStudy:
         return self.settings.to_record(self.plan)
 
     def check_same_system(self, *, may_change: bool = False) -> None:
-        """Raise `UserError` where the campaign had another net or other POVs.
+        """Check that net and POVs are those of the campaign.
 
-        A controller that has changed is a `Notice`, unless it `may_change`.
+        Args:
+            may_change: whether the controller may have changed; otherwise a change is a `Notice`.
+
+        Raises:
+            UserError: where the campaign had another net or other POVs.
         """
         run, road, now = self.run, self.plan.road, self.record()
         if run.settings.net_sha256 not in (None, road.sha256):
@@ -145,7 +199,12 @@ class RunStudy:
 
 
 def notice_changes(run: RecordedCampaign, plan: SimulationPlan) -> None:
-    """Warn with a `Notice` where the files of a controller have changed since a campaign."""
+    """Warn with a `Notice` where the files of a controller have changed since a campaign.
+
+    Args:
+        run: the campaign.
+        plan: the plan with the controllers of now.
+    """
     controllers = [(plan.vut, run.settings.vut, run.settings.vut_files)]
     if plan.povs.own is not None:
         controllers.append((plan.povs.own, run.settings.pov or "", run.settings.pov_files))

@@ -1,4 +1,4 @@
-"""Samplers in comparison with each other and with the truth of a VUT: searches with many seeds."""
+"""Comparison of samplers with each other and with the truth of a VUT, over several seeds."""
 
 from __future__ import annotations
 
@@ -40,9 +40,9 @@ from merge_sumo.simulation.plan import SimulationPlan
 from merge_sumo.workers import Workers
 
 MOST_PROBES = 10_000
-"""Maximum number of failures of which a covered share is one: its error is then below .01."""
+"""Maximum number of failures of which a share is covered: its error is then below .01."""
 COMPARED_BATCH = 20
-"""Cases of a batch by default, for samplers without a batch of their own: that of Table II."""
+"""Cases of a batch of a sampler without a size of its own, as in Table II."""
 
 Task = tuple[str, int]
 """A search: the name of the sampler, and its seed."""
@@ -60,21 +60,30 @@ class SamplerRun:
     outcomes: list[Outcome]
     fmc: list[float]
 
-    def failures(self, level: int) -> FloatArray:
-        """Return the failing cases of a level as points, (m, d)."""
-        return to_unit((one.case for one in self._failing(level)), level)
+    def failures(self, level: int, batch: int | None = None) -> FloatArray:
+        """Return the failing cases of a level as points of the unit cube, (m, d).
 
-    def _failing(self, level: int) -> list[Outcome]:
-        return [one for one in self.outcomes if one.failed and one.case.level == level]
+        Args:
+            level: level of the POV.
+            batch: their batch; None for all.
+        """
+        cases = []
+        for one in self.outcomes:
+            if one.failed and one.case.level == level and batch in (None, one.batch):
+                cases.append(one.case)
+        return to_unit(cases, level)
 
     def covered_shares(self, level: int, points: FloatArray) -> FloatArray:
-        """Return the share of points, (m, d), that the failures cover after each batch."""
-        failing = self.failures(level)
-        batches = np.array([one.batch for one in self._failing(level)], dtype=int)
+        """Return the share of points that the failures cover after each batch, (batches,).
+
+        Args:
+            level: level of the POV.
+            points: points of the unit cube, (m, d).
+        """
         is_covered = np.zeros(len(points), dtype=bool)
         shares = []
         for batch in range(len(self.fmc)):
-            is_covered |= covered(points, failing[batches == batch])
+            is_covered |= covered(points, self.failures(level, batch))
             shares.append(is_covered.mean())
         return np.array(shares)
 
@@ -93,7 +102,10 @@ def search(
         levels: POV levels.
         cases: number of cases of a search.
         batch: cases of a batch; None for those of the sampler, or `COMPARED_BATCH`.
-        tasks: the searches.
+        tasks: name of the sampler and seed of each search.
+
+    Returns:
+        The searches, in the order of `tasks`.
     """
     searches = []
     pool = Pool(levels=levels, scenario=plan.scenario)
@@ -118,18 +130,30 @@ def _lost_search(task: Task) -> SamplerRun:
 
 
 def names_of(options: config.Benchmark) -> list[str]:
-    """Return the names of the samplers to compare; `UserError` for none, or no seeds."""
+    """Return the names of the samplers to compare, each once.
+
+    Args:
+        options: options of the verb.
+
+    Raises:
+        UserError: for no name, or no seeds.
+    """
     known = SAMPLERS if options.samplers is None else options.samplers
     listed = known.split(",") if isinstance(known, str) else known
     names = list(dict.fromkeys(map(str.strip, listed)))
     if not names:
         raise UserError(f"name at least one sampler: {', '.join(SAMPLERS)}")
-    check_least(options, seeds=1)
+    check_least(options, seeds=1, truth_cases=1)
     return names
 
 
 def title(vut: str, levels: Sequence[int]) -> str:
-    """Return the title of searches."""
+    """Return the title of searches.
+
+    Args:
+        vut: spec of the VUT.
+        levels: levels of the POV.
+    """
     return f"{vut} v level {'/'.join(map(level_name, levels))}"
 
 
@@ -137,12 +161,16 @@ def title(vut: str, levels: Sequence[int]) -> str:
 class Study:
     """A plan, and how truths and searches of it run.
 
+    Example:
+        study = Study(plan)
+        searches = study.searches((0,), ["uniform"], config.Benchmark("design1", seeds=3))
+
     Attributes:
         plan: how cases run.
         workers: where they run; by default in this process.
-        cache: folder of the truths, by default the user's.
+        cache: folder of the truths; None for that of the user.
         on_part: called with the progress of each truth, and of all searches together.
-        engine: what moves the vehicles of truths: see `SimulationPlan.with_engine`.
+        engine: engine of the truths, as in `SimulationPlan.with_engine`.
     """
 
     plan: SimulationPlan
@@ -156,7 +184,7 @@ class Study:
 
         Args:
             level: level of the POV.
-            cases: number of cases; by default that of the paper.
+            cases: number of cases; None for that of the paper.
             seed: seed of the cases.
         """
         total = TRUTH_CASES[level] if cases is None else cases
@@ -171,10 +199,19 @@ class Study:
         )
 
     def truths(self, settings: CampaignSettings, options: config.GroundTruth) -> TruthResult:
-        """Return the truth of settings at each of their levels."""
-        by_level = {
-            level: self.truth(level, options.cases, options.seed) for level in settings.levels
-        }
+        """Return the truth of settings at each of their levels.
+
+        Args:
+            settings: the settings.
+            options: numbers of cases and the seed.
+
+        Raises:
+            UserError: for numbers that are too small.
+        """
+        check_least(options, cases=1, seed=0)
+        by_level = {}
+        for level in settings.levels:
+            by_level[level] = self.truth(level, options.cases, options.seed)
         if not self.plan.vut.files_are_known and not is_in_process(settings.vut):
             notice(
                 "merge-sumo does not know which files the program of this VUT loads; this truth is "
@@ -205,12 +242,15 @@ class Study:
     def searches(
         self, levels: tuple[int, ...], samplers: Sequence[str], options: config.Benchmark
     ) -> dict[str, list[SamplerRun]]:
-        """Let each sampler search with each seed; return the searches by sampler.
+        """Let each sampler search with each seed.
 
         Args:
             levels: levels of the POV.
             samplers: names of the samplers.
             options: numbers of seeds and cases, and cases of a batch.
+
+        Returns:
+            The searches of each sampler, in the order of the seeds.
         """
         for level in levels:
             self.plan.povs.check_level(level)
@@ -228,7 +268,13 @@ class Study:
 
 @dataclass(frozen=True, slots=True)
 class Spread:
-    """The median over the seeds, and the quartiles; None where too few seeds have a number."""
+    """Median and quartiles over the seeds.
+
+    Attributes:
+        median: the median; None where too few seeds have a number.
+        low: the lower quartile, likewise.
+        high: the upper quartile, likewise.
+    """
 
     median: float | None
     low: float | None
@@ -236,7 +282,11 @@ class Spread:
 
     @classmethod
     def of(cls, values: ArrayLike) -> Spread:
-        """Return the spread of a number for each seed; NaN and infinity stand for no number."""
+        """Return the spread of a number over the seeds.
+
+        Args:
+            values: the number for each seed, (seeds,); NaN or infinity for none.
+        """
         missing = 1e300  # larger than any number, and finite for the interpolation
         known = np.nan_to_num(np.asarray(values, dtype=float), nan=missing, posinf=missing)
         quantiles: list[float | None] = []
@@ -252,7 +302,7 @@ class SamplerSummary:
     Attributes:
         fmc: failure mode coverage.
         fmc_over_truth: as a share of the truth's; None where that is too small.
-        fmc_over_limit: as a share of that of all known failures.
+        fmc_over_limit: as a share of `SamplerStudy.limit_fmc`.
         covered_share: share of the truth's failures within a radius of a failure found, the mean
             over the levels with any.
         failures: failures found.
@@ -308,7 +358,7 @@ class SamplerStudy(Result):
 
     @cached_property
     def regions(self) -> list[tuple[int, FloatArray]] | None:
-        """Level and points of each region of the truths; None where one cannot tell regions."""
+        """Level and points, (m, d), of each region of the truths; None where one is too small."""
         found = []
         for level, truth in self.truths.items():
             if not truth.tells_regions:
@@ -318,10 +368,11 @@ class SamplerStudy(Result):
 
     @cached_property
     def limit_fmc(self) -> float:
-        """Coverage of all known failures, summed over the levels: no search has more.
+        """FMC of all known failures, summed over the levels: no search has more.
 
-        A truth of a few thousand cases misses places that searches find. At each level this is the
-        coverage of the failures of truth and searches together, or of a dense truth, if it is more.
+        A truth of a few thousand cases misses failures that searches find. At each level this is
+        the FMC of the failures of truth and searches together, or of a dense truth, if that is
+        more.
         """
         total = 0.0
         for level, truth in self.truths.items():
@@ -334,9 +385,9 @@ class SamplerStudy(Result):
 
     @cached_property
     def probes(self) -> dict[int, FloatArray]:
-        """The failures of truths of which the covered share is one, by level.
+        """The failures of which `covered_share` is a share, by level, as points (m, d).
 
-        They are those of the dense truth where there is one: the more, the smaller the error.
+        They are those of the dense truth, if any: the more, the smaller the error.
         """
         points = {}
         for level, truth in self.truths.items():

@@ -8,7 +8,6 @@ import json
 import stat
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass
-from numbers import Integral
 from pathlib import Path
 from typing import Any
 
@@ -42,7 +41,7 @@ TRUTH_CASES = {0: 10_000, 1: 10_000, 2: 20_000, OWN: 10_000}
 DENSE_CASES = 1_000_000
 """Uniform cases of a dense truth, which shows most failures that the paper's number has missed."""
 MOST_FILES_BYTES = 1 << 26
-"""Maximum size of the names and hashes of files in a truth."""
+"""Maximum size of the names and hashes of files in a truth, in bytes."""
 REAL_REGION = 0.03
 """A region of the truth counts when it holds at least this share of its failures."""
 MOST_GROWTH = 0.2
@@ -57,11 +56,15 @@ apart into single failures. Chosen, not tuned."""
 
 @dataclass(frozen=True, slots=True)
 class Truth:
-    """The ground truth of a VUT at a level: n uniform cases and their margins.
+    """The ground truth of a VUT at a level: n uniform cases of d coordinates, and their margins.
+
+    Example:
+        truth = ground_truth(plan, level=0, cases=1000)
+        share = len(truth.failures) / len(truth.margin)
 
     Attributes:
         points: cases in the unit cube, (n, d).
-        margin: below 0 for a failure, (n,), NaN without a verdict.
+        margin: below 0 for a failure, NaN without a verdict, (n,).
         in_sumo: number of cases that ran in SUMO.
     """
 
@@ -76,24 +79,24 @@ class Truth:
 
     @property
     def growth(self) -> float:
-        """The largest share that the same number of further cases could add to FMC."""
+        """The largest share that n further cases could add to its FMC."""
         return growth_bound(self.failures)
 
     @property
     def is_small(self) -> bool:
-        """Whether its FMC is too far from its limit for a share of it to mean anything."""
+        """Whether n further cases could add so much to its FMC that no share of it is shown."""
         return self.growth > MOST_GROWTH
-
-    @property
-    def tells_regions(self) -> bool:
-        """Whether failures are dense enough to be linked into regions."""
-        return self.alone <= MOST_ALONE
 
     @property
     def alone(self) -> float:
         """Share of the failures that have no other one within the radius of FMC."""
         linked = has_neighbour(self.failures)
         return 1.0 - float(linked.mean()) if len(linked) else 0.0
+
+    @property
+    def tells_regions(self) -> bool:
+        """Whether failures are dense enough to be linked into regions."""
+        return self.alone <= MOST_ALONE
 
     def to_record(self) -> dict[str, Any]:
         """Return the truth as JSON has it."""
@@ -110,7 +113,7 @@ class Truth:
         }
 
     def real_regions(self) -> list[FloatArray]:
-        """Return the points of each disjoint region with a real share of the failures."""
+        """Return the points, (m, d), of each region with at least `REAL_REGION` of the failures."""
         points = self.failures
         labels = regions(points)
         found = []
@@ -134,24 +137,21 @@ def ground_truth(
     """Return the ground truth of a plan at a level, from the cache where it is kept.
 
     A truth is only used while the files that the VUT loaded are the same. A plan for the kinematic
-    engine also takes a truth by SUMO. Memory grows by 40 bytes a case, whatever their number.
+    engine also takes a truth by SUMO. Memory grows by 40 bytes a case.
 
     Args:
         plan: how cases run.
         level: POV level.
-        cases: number of uniform cases; by default that of the paper at the level.
+        cases: number of uniform cases; None for that of the paper at the level.
         seed: seed of their points.
-        workers: where they run, by default in this process.
-        cache: folder of truths, by default the user's.
+        workers: where they run; None for this process.
+        cache: folder of truths; None for that of the user.
         on_case: called with the number of cases that have ended.
 
     Raises:
         UserError: where nothing can be kept in the cache, or others can write it.
     """
     count = TRUTH_CASES[level] if cases is None else cases
-    for name, number, least in (("cases", count, 1), ("seed", seed, 0)):
-        if not isinstance(number, Integral) or number < least:
-            raise UserError(f"`{name}` is {number!r}: it must be a whole number, {least} or more")
     plan.povs.check_level(level)
     plan = plan.for_verdicts()
     known = known_truth(plan, level, count, seed, cache=cache, engines=(Engine.SUMO, plan.engine))
@@ -189,20 +189,22 @@ def known_truth(
     cache: Path | None = None,
     engines: Iterable[Engine] = tuple(Engine),
 ) -> Truth | None:
-    """Return the truth that the cache has; None where it has none.
+    """Return a truth from the cache.
 
     Args:
         plan: how the cases would run.
         level: level of the POV.
         cases: number of cases.
         seed: seed of the cases.
-        cache: folder of the truths; by default that of the user.
-        engines: engines in the order of preference.
+        cache: folder of the truths; None for that of the user.
+        engines: engines, the preferred one first.
+
+    Returns:
+        The truth; None where the cache has none by these engines.
     """
     plan = plan.for_verdicts()
     for engine in engines:
-        path = TruthKey(plan.key(level), level, cases, seed, engine).path(cache)
-        truth = read_truth(path, level, cases, plan.scenario)
+        truth = TruthKey(plan.key(level), level, cases, seed, engine).read(plan.scenario, cache)
         if truth is not None:
             return truth
     return None
@@ -213,11 +215,11 @@ class TruthKey:
     """The key of a truth in the cache.
 
     Attributes:
-        plan: what decides the outcomes: `SimulationPlan.key` for the level.
+        plan: all that decides the outcomes: `SimulationPlan.key` for the level.
         level: level of the POV.
         cases: number of cases.
         seed: seed of their points.
-        engine: what moved the vehicles.
+        engine: the engine that moved the vehicles.
     """
 
     plan: Mapping[str, Any]
@@ -227,42 +229,45 @@ class TruthKey:
     engine: Engine = Engine.SUMO
 
     def path(self, cache: Path | None = None) -> Path:
-        """Return the file of the truth in the cache."""
+        """Return the file of the truth in the cache.
+
+        Args:
+            cache: folder of the truths; None for that of the user.
+        """
         key = hashlib.sha256(json.dumps(asdict(self), sort_keys=True).encode()).hexdigest()[:24]
         return (cache or cache_folder()) / f"truth-{key}.npz"
 
+    def read(self, scenario: Scenario, cache: Path | None = None) -> Truth | None:
+        """Read the truth from the cache.
 
-def read_truth(path: Path, level: int, cases: int, scenario: Scenario) -> Truth | None:
-    """Return the truth in a file of the cache; None where it cannot be used.
+        Args:
+            scenario: scenario of the cases.
+            cache: folder of the truths; None for that of the user.
 
-    That is where the file is missing or torn, has other shapes or belongs to another truth, where
-    others can write the cache, and where a file that the VUT loaded has changed.
-
-    Args:
-        path: the file.
-        level: level of the truth.
-        cases: its number of cases.
-        scenario: scenario of the cases.
-    """
-    dims = len(scenario.dimensions(level))
-    try:
-        check_private(path.parent)
-        if regular(path).stat().st_size > 8 * cases * (dims + 1) + MOST_FILES_BYTES:
+        Returns:
+            The truth; None where the file is missing or torn, has other shapes or belongs to
+            another key, where others can write the cache, and where a file that the VUT loaded has
+            changed.
+        """
+        path, dims = self.path(cache), len(scenario.dimensions(self.level))
+        try:
+            check_private(path.parent)
+            if regular(path).stat().st_size > 8 * self.cases * (dims + 1) + MOST_FILES_BYTES:
+                return None
+            data = read_arrays(path, "points", "margin", "in_sumo", "files", "of")
+            files = decode(str(data["files"]), dict[str, str | None])
+            unchanged = all(sha256_of(Path(name)) == sha256 for name, sha256 in files.items())
+        except (OSError, UserError):
             return None
-        data = read_arrays(path, "points", "margin", "in_sumo", "files", "of")
-        files = decode(str(data["files"]), dict[str, str | None])
-        unchanged = all(sha256_of(Path(name)) == sha256 for name, sha256 in files.items())
-    except (OSError, UserError):
-        return None
-    points, margin = data["points"], data["margin"]
-    has_shapes = points.shape == (cases, dims) and margin.shape == (cases,)
-    if not (unchanged and has_shapes and str(data["of"]) == path.stem):
-        return None
-    return Truth(points, margin, int(data["in_sumo"]))
+        points, margin = data["points"], data["margin"]
+        has_shapes = points.shape == (self.cases, dims) and margin.shape == (self.cases,)
+        if not (unchanged and has_shapes and str(data["of"]) == path.stem):
+            return None
+        return Truth(points, margin, int(data["in_sumo"]))
 
 
 def _margin_of(episode: Episode) -> tuple[float, bool, Files]:
-    """Return the margin, NaN without a verdict, whether SUMO ran the case, and the loaded files."""
+    """Return the margin (NaN without a verdict), whether SUMO ran the case, and loaded files."""
     margin = episode.outcome.margin
     files = episode.files | episode.pov_files
     return np.nan if margin is None else margin, episode.in_sumo, files
@@ -277,9 +282,9 @@ class TruthResult(Result):
         failing = truth.points[truth.margin < 0.0]
 
     Attributes:
-        vut: the VUT.
+        vut: spec of the VUT.
         truths: the truth by level.
-        criterion: what counts as a failure.
+        criterion: the criterion of a failure.
         scenario: the scenario of the cases.
     """
 
@@ -289,7 +294,7 @@ class TruthResult(Result):
     scenario: Scenario
 
     def to_record(self) -> dict[str, Any]:
-        """Return what `--json` prints: that of the level, or sums with a list of the levels."""
+        """Return what `--json` prints: the record of the level, or sums and a list of levels."""
         same = {"vut": self.vut, "fail_when": self.criterion.as_written}
         levels = [{**same, "level": one, **of.to_record()} for one, of in self.truths.items()]
         if len(levels) == 1:

@@ -21,7 +21,7 @@ from support.processes import cpu_s
 from support.writers import tree
 
 import merge_sumo as ms
-from merge_sumo.analysis.truth import ground_truth, read_truth
+from merge_sumo.analysis.truth import ground_truth
 from merge_sumo.campaigns.recorded import OUTCOMES, SETTINGS, TRAJECTORIES
 from merge_sumo.errors import UserError
 from merge_sumo.road import xml_input
@@ -64,7 +64,7 @@ def export(root: Path) -> object:
 
 
 def believe(root: Path) -> str:
-    truth = read_truth(KEPT.path(root / "sent"), 0, KEPT.cases, US23)
+    truth = KEPT.read(US23, root / "sent")
     return "not believed" if truth is None else "believed"
 
 
@@ -222,6 +222,6 @@ def test_a_cache_that_another_user_may_have_written_is_not_used(tmp_path, monkey
         monkeypatch.setattr(os, "geteuid", lambda: 12345)
     else:
         tmp_path.chmod(0o777)
-    assert read_truth(KEPT.path(tmp_path), 0, KEPT.cases, US23) is None
+    assert KEPT.read(US23, tmp_path) is None
     with pytest.raises(UserError, match=f"is not used: .*{how} "):
         ground_truth(plan_for("design1"), 0, KEPT.cases, cache=tmp_path)
