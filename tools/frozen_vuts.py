@@ -151,7 +151,7 @@ FROZEN_VUTS: Final[dict[str, Callable[[int], Driver]]] = {
 class FrozenKind(ControllerKind):
     """`frozen:NAME`."""
 
-    own_code, by_arrays = False, True
+    own_code = asks_sumo = False
 
     def __init__(self, spec: ControllerSpec, options: ControllerOptions) -> None:
         """Find the VUT; `UserError` for another name."""

@@ -28,7 +28,6 @@ class BuiltInKind(ControllerKind):
     """A VUT that the package brings, with its parameters."""
 
     own_code = asks_sumo = False
-    by_arrays = True
 
     def __init__(self, spec: ControllerSpec, options: ControllerOptions) -> None:
         """Take the parameters; `UserError` for those that it cannot have."""
@@ -39,7 +38,7 @@ class BuiltInKind(ControllerKind):
         chosen = {name: float(value) for name, value in spec.numbers().items()}
         for name in chosen:
             if name not in known:
-                raise spec.has_no(name, known)
+                raise spec.unknown_parameter(name, known)
         if design is not None:
             try:
                 self._design = replace(design, **chosen)

@@ -157,7 +157,11 @@ class Start(msgspec.Struct, array_like=True, frozen=True):
 
     @classmethod
     def of(cls, case: Case) -> Self:
-        """Return the start of a case."""
+        """Return the start of a case.
+
+        Args:
+            case: the case.
+        """
         scenario = case.scenario
         x_m, v_mps = np.array(case.starts(), dtype=np.float64).T
         conflicting = POV
@@ -196,10 +200,18 @@ class Controller:
     single_use: bool = False
 
     def reset(self, start: Start) -> None:
-        """Begin an episode."""
+        """Begin an episode.
+
+        Args:
+            start: its first observation.
+        """
 
     def act(self, seen: Seen) -> Any:
-        """Return the acceleration for the next step, m/s2, or (acceleration, whether to merge)."""
+        """Return the acceleration for the next step, m/s2, or (acceleration, whether to merge).
+
+        Args:
+            seen: the observation at this step.
+        """
         raise NotImplementedError
 
     def signals(self) -> StepSignals:
@@ -207,7 +219,7 @@ class Controller:
         return {}
 
     def parameters(self) -> Mapping[str, float]:
-        """Return the numbers that a spec may set, with their present values."""
+        """Return the numbers that a spec may set, by name, with their present values."""
         return {}
 
     def close(self) -> None:
@@ -218,19 +230,34 @@ class ControllerDriver(Driver):
     """A driver that learns of an episode only its start, so that it can run in another process."""
 
     def begin(self, corridor: int, case: Case) -> None:
-        """Begin an episode of a case."""
+        """Begin an episode of a case.
+
+        Args:
+            corridor: index of the corridor.
+            case: the case.
+        """
         self.reset(corridor, Start.of(case))
 
     @abstractmethod
     def reset(self, corridor: int, start: Start) -> None:
-        """Begin an episode in a corridor."""
+        """Begin an episode in a corridor.
+
+        Args:
+            corridor: index of the corridor.
+            start: first observation of the episode.
+        """
 
 
 class ControllerArray(ControllerDriver):
     """Drives each corridor by a controller of its own.
 
-    An error of a controller is the reason of its corridor alone; the next episode in that corridor
-    has a new controller.
+    Here a fault of a controller begins its way to the record. A call that raises, is late, or
+    answers no acceleration ends with NaN as the answer of its corridor, and `reason` has the error
+    in words. In a child process `child_main._Host` sends both, and `hosted.HostedDriver` gives both
+    to the parent. `Rollout.note_faults` finds the NaN, asks for the reason, and ends that episode
+    alone as `End.VUT_ERROR`; `Outcome.error` and the line of `outcomes.jsonl` have the words. The
+    next episode in the corridor has a new controller. A crash of the child process takes another
+    way: see `HostedDriver`.
     """
 
     def __init__(self, corridors: int, new: Callable[[], Controller], deadline_s: float) -> None:
@@ -256,7 +283,12 @@ class ControllerArray(ControllerDriver):
             raise
 
     def reset(self, corridor: int, start: Start) -> None:
-        """Reset the controller of a corridor; an error is kept as the reason of its answer."""
+        """Reset the controller of a corridor; an error is kept as the reason of its answer.
+
+        Args:
+            corridor: index of the corridor.
+            start: first observation of the episode.
+        """
         self._reasons[corridor], self._lanes_m[corridor] = None, start.lane_m
         is_new = self._replace[corridor]
         if is_new:
@@ -274,7 +306,11 @@ class ControllerArray(ControllerDriver):
             self._fail(corridor, f"reset: {self._deadline.reason(error)}")
 
     def act(self, scene: Scene) -> FloatArray:
-        """Return the answers of the controllers; NaN where there is a reason."""
+        """Return the answers of the controllers, (K,), m/s2; NaN where there is a reason.
+
+        Args:
+            scene: the state of all corridors.
+        """
         self._signals = {}
         answers, merge_requests = [0.0] * self.corridors, [NO_REQUEST] * self.corridors
         conflicting = [POV] * self.corridors
@@ -307,7 +343,11 @@ class ControllerArray(ControllerDriver):
         return np.array(answers)
 
     def reason(self, corridor: int) -> str | None:
-        """Return the error of the controller of a corridor."""
+        """Return the error of the controller of a corridor; None without one.
+
+        Args:
+            corridor: index of the corridor.
+        """
         return self._reasons[corridor]
 
     def signals(self) -> Mapping[int, StepSignals]:
@@ -331,13 +371,20 @@ class ControllerArray(ControllerDriver):
 
 
 class WrongAnswerError(Exception):
-    """A controller answered something that is not an acceleration, or not whether to merge."""
+    """The answer of a controller is not an acceleration, or its merge request not a truth value."""
 
 
 def as_answer(answer: Any) -> tuple[float, int]:
-    """Return an answer as an acceleration and a merge request, `NO_REQUEST` where it has none.
+    """Return an answer as an acceleration, m/s2, and a merge request.
 
-    Raises `WrongAnswerError` unless it is one real number or (number, whether to merge).
+    Args:
+        answer: one real number, or (number, whether to merge).
+
+    Returns:
+        The acceleration, and `MERGE`, `STAY`, or `NO_REQUEST` for one number.
+
+    Raises:
+        WrongAnswerError: for another answer.
     """
     if type(answer) is float:
         return answer, NO_REQUEST
@@ -365,7 +412,14 @@ MERGES_ABOVE = 0.5
 
 
 def as_merge(number: float) -> bool:
-    """Return whether an output is a merge request; `WrongAnswerError` for NaN and infinity."""
+    """Return whether an output is a merge request.
+
+    Args:
+        number: the output; a request above 0.5.
+
+    Raises:
+        WrongAnswerError: for NaN and infinity.
+    """
     if not math.isfinite(number):
         raise WrongAnswerError(f"requests {number} instead of a number, to merge or not")
     return number > MERGES_ABOVE

@@ -1,4 +1,4 @@
-"""Limit the time of calls to a controller, and describe the errors of calls."""
+"""The time limit of calls to a controller, and the words for their errors."""
 
 from __future__ import annotations
 
@@ -12,24 +12,20 @@ from contextlib import suppress
 from pathlib import Path
 from time import perf_counter
 from types import FrameType, TracebackType
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 from merge_sumo.interrupt import Stopped
 from merge_sumo.scenario.trajectory import as_reason
 
 
 class DeadlineExceeded(BaseException):
-    """A call took too long. Not an Exception, so that a controller does not catch it by habit."""
+    """A call took too long; no `Exception`, so that a controller does not catch it by habit."""
 
 
 RING_AFTER = 1.02
 """The timer rings at this share of the deadline, when the call is certainly late."""
 MOST_CHARACTERS = 300
 """Maximum length of a text that comes from a controller."""
-
-heartbeat: list[Callable[[float], None]] = []
-"""Called with the time before each call. Only a process that hosts a controller has one: in such a
-process an interrupt is the controller's own doing."""
 
 
 class Deadline:
@@ -49,7 +45,11 @@ class Deadline:
 
     Attributes:
         deadline_s: time for a call.
+        before_call: called with the time in s before each call, in a process that hosts a
+            controller; None in others. In such a process an interrupt is the controller's own.
     """
+
+    before_call: ClassVar[Callable[[float], None] | None] = None
 
     def __init__(self, deadline_s: float) -> None:
         self.deadline_s, self._since_s = deadline_s, math.inf
@@ -78,20 +78,28 @@ class Deadline:
             first_s = RING_AFTER * self.deadline_s
             signal.setitimer(signal.ITIMER_REAL, first_s, self.deadline_s / 10)
         now_s = perf_counter()
-        if heartbeat:
-            heartbeat[0](now_s)
+        if Deadline.before_call is not None:
+            Deadline.before_call(now_s)
         self._since_s = now_s
 
     def stop(self) -> None:
-        """End the time of a call; raises `DeadlineExceeded` if it took too long."""
+        """End the time of a call.
+
+        Raises:
+            DeadlineExceeded: if it took too long.
+        """
         spent_s, self._since_s = perf_counter() - self._since_s, math.inf
         if spent_s > self.deadline_s:
             raise DeadlineExceeded
 
     def reason(self, error: BaseException) -> str:
-        """Describe the error of a call, with file and line; Ctrl-C is raised again."""
+        """Return the error of a call in words, with file and line; Ctrl-C is raised again.
+
+        Args:
+            error: what the call raised.
+        """
         self._since_s = math.inf
-        if isinstance(error, (Stopped, KeyboardInterrupt)) and not heartbeat:
+        if isinstance(error, (Stopped, KeyboardInterrupt)) and Deadline.before_call is None:
             raise error
         if isinstance(error, DeadlineExceeded):
             return f"took longer than the deadline of {self.deadline_s:g} s"
@@ -106,7 +114,12 @@ class Deadline:
 
 
 def closed(deadline_s: float, close: Callable[[], Any]) -> None:
-    """Call a controller's `close` within the deadline; an error is printed, it changes nothing."""
+    """Call a controller's `close` within the deadline; an error is printed and changes nothing.
+
+    Args:
+        deadline_s: time for the call.
+        close: the function to call.
+    """
     deadline = Deadline(deadline_s)  # its own: this may be part of another call
     try:
         with deadline:
@@ -121,16 +134,18 @@ def closed(deadline_s: float, close: Callable[[], Any]) -> None:
 def text_of(thing: object, as_text: Callable[[Any], str] = str) -> str:
     """Return the text of a controller's object in one line, even where making it raises.
 
-    The text of a subclass of `str` is taken as the characters that it has.
+    Args:
+        thing: the object.
+        as_text: makes its text.
     """
-    try:
+    try:  # a subclass of `str` may override its methods: take its characters only
         return as_reason(str.__str__(as_text(thing)))[:MOST_CHARACTERS]
     except Exception as error:
         return f"({type(error).__name__} when it was to be shown)"
 
 
 def _place(error: BaseException) -> str:
-    """Return where an error was raised, " (FILE, line N)"; "" where that was not in a VUT."""
+    """Return where an error was raised, " (FILE, line N)"; "" for an error of this package."""
     last: TracebackType | None = error.__traceback__
     while last is not None and last.tb_next is not None:  # a recursion leaves thousands
         last = last.tb_next

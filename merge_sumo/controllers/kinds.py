@@ -1,9 +1,9 @@
-"""The kinds of controllers by name, and the way from a text, as after `--vut`, to a controller."""
+"""The kinds of controllers by name; from a text, as after `--vut`, to a loaded controller."""
 
 from __future__ import annotations
 
 from merge_sumo.controllers.built_in import BUILT_IN_VUTS
-from merge_sumo.controllers.hosting import SUPPORTED, HostedKind
+from merge_sumo.controllers.hosted import SUPPORTED, HostedKind
 from merge_sumo.controllers.python import installed_vuts
 from merge_sumo.controllers.spec import (
     BUILT_IN,
@@ -14,6 +14,7 @@ from merge_sumo.controllers.spec import (
     ControllerKind,
     ControllerOptions,
     ControllerSpec,
+    load_as,
 )
 from merge_sumo.errors import UserError
 from merge_sumo.printable import meant
@@ -38,9 +39,13 @@ KINDS: Registry[type[ControllerKind]] = Registry(
 
 
 def parse(text: str) -> ControllerSpec:
-    """Return the parts of `[KIND:]ARGUMENT[?NAME=VALUE&...]`; an unknown name is of `installed`.
+    """Return the parts of `[KIND:]ARGUMENT[?NAME=VALUE&...]`.
 
-    Raises `UserError` for a malformed parameter, and for one that is given twice.
+    Args:
+        text: a text as after `--vut`; an unknown name counts as that of an installed VUT.
+
+    Raises:
+        UserError: for a malformed parameter, and for one that is given twice.
     """
     kind, _, argument = text.partition(":")
     if kind not in KINDS or kind in WITHOUT_PREFIX:
@@ -67,7 +72,7 @@ def load(text: str, options: ControllerOptions | None = None) -> ControllerKind:
 
     Args:
         text: as after `--vut`.
-        options: how it is hosted.
+        options: how it is hosted; None for the defaults.
 
     Raises:
         UserError: for a text that names no controller, or one that cannot be loaded.
@@ -76,10 +81,9 @@ def load(text: str, options: ControllerOptions | None = None) -> ControllerKind:
     if spec.kind == INSTALLED and spec.argument not in installed_vuts():
         raise UserError(_why_unknown(spec.argument))
     kind = KINDS[spec.kind]
-    is_hosted = kind.hosted and SUPPORTED and not options.in_process
-    controller = HostedKind(spec, options, kind) if is_hosted else kind(spec, options)
-    controller.files  # noqa: B018 (hashed before it drives)
-    return controller
+    if kind.hosted and SUPPORTED and not options.in_process:
+        return load_as(HostedKind, spec, options, None, kind)
+    return load_as(kind, spec, options)
 
 
 def _why_unknown(name: str) -> str:
@@ -94,16 +98,28 @@ def _why_unknown(name: str) -> str:
 
 
 def is_built_in(text: str) -> bool:
-    """Return whether a spec names a VUT that the package brings, with parameters or without."""
+    """Return whether a VUT is one of this package, with parameters or without.
+
+    Args:
+        text: as after `--vut`.
+    """
     return parse(text).kind == BUILT_IN
 
 
 def waits_for_client(text: str) -> bool:
-    """Return whether a user starts the VUT's program, which then cannot be started again."""
+    """Return whether the user starts the VUT's program, so that it cannot be started again.
+
+    Args:
+        text: as after `--vut`.
+    """
     spec = parse(text)
     return KINDS[spec.kind].waits(spec.argument)
 
 
 def runs_code(text: str) -> bool:
-    """Return whether to test a VUT is to run code that is not of this package or of SUMO."""
+    """Return whether a test of a VUT runs code that is neither of this package nor of SUMO.
+
+    Args:
+        text: as after `--vut`.
+    """
     return KINDS[parse(text).kind].own_code and not waits_for_client(text)

@@ -1,4 +1,4 @@
-"""Processes that run a controller: started, watched and stopped, with their output in a log."""
+"""Processes of controllers: started, watched and stopped, with their output in a log."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ from merge_sumo.scenario.trajectory import as_reason
 from merge_sumo.spawning import end_with, python_command
 
 LOG = "controller.log"
-"""In the folder of a campaign."""
+"""Name of the log of a campaign, in its folder."""
 MOST_BYTES = 4 << 20
-"""A longer log begins again: a controller may print for ever."""
+"""A log that is longer begins again, as a controller may print for ever."""
 LINES = 40
-"""Lines of the end of a log in a report."""
+"""Number of last lines of a log in a report."""
 ENDING_S = 2.0
-"""Time that a process has to end by itself."""
+"""Time for a process to end by itself."""
 
 
 class Output:
@@ -44,7 +44,12 @@ class Output:
     """
 
     def __init__(self, pipe: IO[bytes], log: Path | None) -> None:
-        """Read a pipe in a thread."""
+        """Read a pipe in a thread.
+
+        Args:
+            pipe: standard output and standard error of a process.
+            log: file to which the text is added; None shows it.
+        """
         self.log, self.tail = log, b""
         self._pipe, self._pending = pipe, b""
         self._thread = threading.Thread(target=self._read, daemon=True)
@@ -61,7 +66,7 @@ class Output:
         return as_reason(lines[-1]) if lines else ""
 
     def close(self) -> None:
-        """Wait a second for the rest; later output of the processes that it started is lost."""
+        """Wait a second for the rest; what its child processes print later is lost."""
         self._thread.join(1.0)
 
     def _read(self) -> None:
@@ -82,12 +87,16 @@ class Output:
 
 
 def _is_writable_log(log: Path) -> bool:
-    """Return whether a log is a file or not there; anything else is not followed or waited for."""
+    """Return whether a log is a file, or does not exist yet."""
     return not log.is_symlink() and (log.is_file() or not log.exists())
 
 
 def end_of(log: Path) -> str:
-    """Return the last lines of a log, printable; "" where there is no such file."""
+    """Return the last lines of a log, printable; "" without such a file.
+
+    Args:
+        log: the file.
+    """
     text = b""
     with suppress(OSError):
         if _is_writable_log(log):
@@ -99,7 +108,15 @@ def end_of(log: Path) -> str:
 
 
 def append(log: Path, content: bytes) -> None:
-    """Add to a log, which begins again when it is long; OSError when that cannot be done."""
+    """Add to a log, which begins again when it is long.
+
+    Args:
+        log: the file; a link, a pipe or a folder in its place is left alone.
+        content: what is added.
+
+    Raises:
+        OSError: if it cannot be written.
+    """
     if _is_writable_log(log):
         with log.open("ab", buffering=0) as file:
             if file.tell() > MOST_BYTES:
@@ -121,7 +138,7 @@ class Started:
             name: its description, for an error message.
             command: its arguments.
             log: file to which its output is added; None shows it.
-            more: arguments of `subprocess.Popen`.
+            **more: further arguments of `subprocess.Popen`.
 
         Raises:
             UserError: if it cannot be started.
@@ -148,18 +165,33 @@ class Started:
         self.output.close()
 
     def signal(self, number: int) -> None:
-        """Send a signal to the process and to the processes that it started, if any is left."""
+        """Send a signal to the process and to the processes that it started, if any is left.
+
+        Args:
+            number: the signal.
+        """
         with suppress(ProcessLookupError, PermissionError):
             os.killpg(self._process.pid, number)
 
 
 BROKEN = "broke the channel to its process"
+"""The reason of a process that closes its connection, or sends what is not a reply."""
 
 
 class ProcessDiedError(Exception):
-    """A process ended, for a reason; `hung` if it was killed for its silence."""
+    """A child process has ended.
+
+    Attributes:
+        hung: whether it was killed because it sent no reply in time.
+    """
 
     def __init__(self, reason: str, *, hung: bool = False) -> None:
+        """Keep how it ended.
+
+        Args:
+            reason: a phrase without its subject, as "ended its process with exit code 3".
+            hung: whether it was killed because it sent no reply in time.
+        """
         super().__init__(reason)
         self.hung = hung
 
@@ -169,6 +201,7 @@ class ChildProcess(Started):
 
     Attributes:
         alive: whether messages can be sent.
+        folder: its folder for temporary files, which is removed when it ends; also in its settings.
     """
 
     alive = False
@@ -177,43 +210,32 @@ class ChildProcess(Started):
         self,
         main: str,
         settings: Mapping[str, Any],
-        folder: ScratchFolder,
         environment: Mapping[str, str],
-        *,
-        cwd: str | None = None,
-        log: Path | None = None,
+        log: Path | None,
     ) -> None:
         """Start a process.
 
         Args:
             main: "MODULE:FUNCTION" of this package, which gets its connection by `connected`.
             settings: argument of the function.
-            folder: is removed when the process ends.
-            environment: of the process.
-            cwd: its working folder, by default that of this process.
+            environment: environment variables of the process.
             log: file to which its output is added; None shows it.
 
         Raises:
             UserError: if no process can be started.
         """
-        self._folder = folder
+        self.folder = ScratchFolder()
         self._socket, theirs = socket.socketpair()
         their_lifeline, self._lifeline = os.pipe()
         inherited = {"lifeline": their_lifeline, "connection": theirs.fileno()}
         try:
             super().__init__(
                 "a process for the VUT",
-                python_command(main, {**settings, **inherited}),
+                python_command(main, {**settings, **inherited, "folder": self.folder.name}),
                 log,
                 pass_fds=tuple(inherited.values()),
-                cwd=cwd,
-                env=environment,
+                env={**environment, "TMPDIR": self.folder.name},
             )
-        except UserError:
-            self._socket.close()
-            os.close(self._lifeline)
-            folder.cleanup()
-            raise
         finally:
             theirs.close()
             os.close(their_lifeline)
@@ -221,7 +243,14 @@ class ChildProcess(Started):
         self._connection = Connection(os.dup(self._socket.fileno()))
 
     def send(self, content: bytes) -> None:
-        """Send a message; raises `ProcessDiedError` if the process ended."""
+        """Send a message.
+
+        Args:
+            content: the message.
+
+        Raises:
+            ProcessDiedError: if the process ended.
+        """
         try:
             self._connection.send_bytes(content)
         except OSError:
@@ -231,7 +260,7 @@ class ChildProcess(Started):
         """Return the next message.
 
         Args:
-            patience_s: time for it to come; also for each of its parts, where it is sent in parts.
+            patience_s: time for it to come, and for each of its parts.
             late: the reason of the error if it does not come in time.
 
         Raises:
@@ -255,7 +284,7 @@ class ChildProcess(Started):
             raise
 
     def exit_code(self) -> int | None:
-        """Wait a little for the process to end; return its exit code, None where it still runs."""
+        """Return the exit code of the process after a short wait; None where it still runs."""
         with suppress(subprocess.TimeoutExpired):
             return self._process.wait(ENDING_S)
         return None
@@ -269,7 +298,7 @@ class ChildProcess(Started):
         self._socket.close()
         os.close(self._lifeline)
         self.kill_group()
-        self._folder.cleanup()
+        self.folder.cleanup()
 
     def __del__(self) -> None:
         """End a process that nothing refers to."""
@@ -295,7 +324,7 @@ def connected(settings: Mapping[str, Any], **limits: int) -> Connection:
 
     Args:
         settings: argument of its main function.
-        limits: of the system for this process, as RLIMIT_DATA.
+        **limits: limits of the system for this process, as RLIMIT_DATA.
     """
     lower_limits(**limits, RLIMIT_CORE=0)
     end_with(settings["lifeline"])
@@ -306,7 +335,14 @@ def connected(settings: Mapping[str, Any], **limits: int) -> Connection:
 
 
 def split_command(command: str) -> list[str]:
-    """Return the arguments of a command line; `UserError` when its program is not there."""
+    """Return the arguments of a command line.
+
+    Args:
+        command: a command as in a terminal.
+
+    Raises:
+        UserError: if it cannot be read, or its program does not exist.
+    """
     try:
         arguments = shlex.split(command)
     except ValueError as error:
@@ -320,9 +356,13 @@ def split_command(command: str) -> list[str]:
 
 
 def code_of(arguments: Sequence[str]) -> tuple[Path, ...]:
-    """Return the file of code that a command runs, if it is known; it reads and writes others.
+    """Return the file of code that a command runs, or nothing where it is not known.
 
-    That is the first file but programs that this machine has for all, as an interpreter.
+    That is the first file that is no program of this machine, as an interpreter is. Other files may
+    be data, which the command reads and writes.
+
+    Args:
+        arguments: the command.
     """
     for word in arguments:
         if word in ("-c", "-e", "-m"):  # the code follows by name or as a text
@@ -355,7 +395,11 @@ class Program(Started):
         )
 
     def ended(self, patience_s: float) -> str:
-        """Return how it ended and the last line that it printed; "" when it still runs."""
+        """Return how it ended and the last line that it printed; "" when it still runs.
+
+        Args:
+            patience_s: time to wait for its end.
+        """
         try:
             code = self._process.wait(patience_s)
         except subprocess.TimeoutExpired:
@@ -365,7 +409,11 @@ class Program(Started):
         return f"the controller {how}" + (f": {line}" if line else "")
 
     def stop(self, grace_s: float) -> None:
-        """End the program and its child processes; it has some time to end by itself first."""
+        """End the program and its child processes.
+
+        Args:
+            grace_s: time to end by itself first.
+        """
         try:
             self._process.wait(grace_s)
         except subprocess.TimeoutExpired:

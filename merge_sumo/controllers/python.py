@@ -95,7 +95,7 @@ class OfPython(ControllerKind):
             if name in defaults:
                 self._keywords[name] = value
             elif self._is_function:
-                raise spec.has_no(name, defaults)
+                raise spec.unknown_parameter(name, defaults)
             else:
                 self._attributes[name] = value
         self._numbers: dict[str, float] = {}
@@ -147,7 +147,7 @@ class OfPython(ControllerKind):
             raise UserError(f"{self.spec} cannot be {how}: {why}") from error
         for name in self._attributes:
             if name not in present:
-                raise self.spec.has_no(name, present)
+                raise self.spec.unknown_parameter(name, present)
         return made
 
     def present(self, made: Any) -> dict[str, float]:

@@ -1,6 +1,6 @@
-"""The name of a controller in its parts, how it is hosted, and its kind.
+"""The text of a controller in its parts, how it is hosted, and its kind.
 
-`kinds.parse` reads a name, and `kinds.load` gives the `ControllerKind` of it, which opens drivers.
+`kinds.parse` reads a text, and `kinds.load` gives the `ControllerKind` of it, which opens drivers.
 """
 
 from __future__ import annotations
@@ -9,11 +9,9 @@ import math
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import closing
 from dataclasses import dataclass, replace
-from functools import cached_property
 from importlib import import_module
-from numbers import Real
 from pathlib import Path
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, Self, TypeVar
 
 import msgspec
 
@@ -52,7 +50,7 @@ class ControllerOptions:
             ("deadline_s", "seconds", self.deadline_s),
             ("vut_memory_gib", "GiB", self.memory_gib),
         ):
-            if not (isinstance(value, Real) and math.isfinite(value) and float(value) > 0.0):
+            if not (isinstance(value, int | float) and 0.0 < value < math.inf):
                 raise UserError(f"`{option}` is {value!r}: give {unit}, more than 0")
 
 
@@ -76,34 +74,57 @@ class ControllerSpec(msgspec.Struct, frozen=True):
         return f"{head}?{options}" if options else head
 
     def numbers(self) -> dict[str, float]:
-        """Return the parameters as numbers, whole ones as int; `UserError` for other text."""
+        """Return the parameters as numbers, whole ones as int.
+
+        Raises:
+            UserError: for a value that is not a finite number.
+        """
         numbers: dict[str, float] = {}
         for name, text in self.parameters:
             try:
                 value = float(text)
-                numbers[name] = int(text) if text.lstrip("+-").isdecimal() else value
             except ValueError:
                 value = math.nan
             if not math.isfinite(value):
                 raise UserError(f"{self}: {name} is {text!r}: give a number")
+            numbers[name] = int(text) if text.lstrip("+-").isdecimal() else value
         return numbers
 
     def with_value(self, name: str, value: float) -> ControllerSpec:
-        """Return the spec with another value of a parameter."""
+        """Return the spec with another value of a parameter.
+
+        Args:
+            name: the parameter.
+            value: its value, which is written with 12 digits.
+        """
         parameters = {**dict(self.parameters), name: f"{value:.12g}"}
         return msgspec.structs.replace(self, parameters=tuple(parameters.items()))
 
-    def has_no(self, name: str, known: Iterable[str]) -> UserError:
-        """Return the error for a parameter that the controller does not have among `known`."""
+    def unknown_parameter(self, name: str, known: Iterable[str]) -> UserError:
+        """Return the error for a parameter that the controller does not have.
+
+        Args:
+            name: the parameter.
+            known: the parameters that it has.
+        """
         names = ", ".join(sorted(known))
         choice = f"choose from {names}" if names else "it has none"
         return UserError(f"{self}: it has no parameter {name!r}: {choice}")
 
 
 class ControllerKind:
-    """A kind of controller: a subclass. Its instance is a controller of that kind, loaded.
+    """A controller that has been loaded; each kind of controller is a subclass.
 
-    A kind whose corridors have a controller each implements `controller`; another one, `driver`.
+    The settings of a campaign hold the text of a controller, its plan holds an instance of this
+    class, and each process that runs cases opens a `Driver` of it. A kind whose corridors have a
+    controller each implements `controller`; another kind implements `driver`.
+
+    Example:
+        ```python
+        vut = kinds.load("my_vut.py:MyVut?gain=2")
+        with closing(vut.open(corridors=8)) as driver:
+            driver.begin(0, case)
+        ```
 
     Attributes:
         form: how a user writes it; "" for a kind that is not listed.
@@ -111,18 +132,18 @@ class ControllerKind:
         example: an option `--vut` that names one.
         has_parameters: whether "?" ends the argument in a spec.
         no_parameters: why a spec cannot set parameters, in a clause; "" where it can.
-        hosted: whether it runs a user's code in this process, unless that has one of its own.
-        own_code: whether to test it is to run code that is neither of this package nor of SUMO.
-        files_are_known: whether `code` is all of which it is made before it drives.
+        hosted: whether it runs a user's code, so that `kinds.load` gives it a process of its own.
+        own_code: whether a test runs code that is neither of this package nor of SUMO.
+        files_are_known: whether `code` names all files of the controller before it drives.
         asks_sumo: whether its drivers ask SUMO, or are SUMO's own; their cases take longer.
-        by_arrays: whether its drivers need nothing of SUMO, and take any number of corridors.
         spec: the controller.
         options: how it is hosted.
-        code: files of code of the user's, as far as they are known.
+        code: files of the user's code, as far as they are known.
+        files: the same with their hashes when the controller was loaded first.
         max_corridors: corridors that one driver can serve; None for any number.
         max_workers: processes that can have such a driver at a time; None for any number.
         vut_type: attributes of the SUMO vType with which SUMO itself drives; None if it does not.
-        settable: numbers that its spec may set, with present values; None where a driver knows.
+        settable: numbers that its spec may set, with present values; None if a driver has to tell.
         no_pov: why it cannot drive a POV; "" where it can.
     """
 
@@ -136,21 +157,35 @@ class ControllerKind:
     no_parameters: str = ""
     files_are_known: bool = True
     asks_sumo: bool = True
-    by_arrays: bool = False
     code: tuple[Path, ...] = ()
+    files: Files
     max_corridors: int | None = None
     max_workers: int | None = None
     vut_type: Mapping[str, str] | None = None
     settable: Mapping[str, float] | None = None
     no_pov: str = ""
+    _more: tuple[Any, ...] = ()
+    """Further arguments of the constructor."""
 
     def __init__(self, spec: ControllerSpec, options: ControllerOptions) -> None:
-        """Load a controller; subclasses raise `UserError` where it cannot be."""
+        """Load a controller.
+
+        Args:
+            spec: the controller.
+            options: how it is hosted.
+
+        Raises:
+            UserError: by subclasses, where it cannot be loaded.
+        """
         self.spec, self.options = spec, options
 
     @classmethod
     def waits(cls, _argument: str) -> bool:
-        """Return whether the controller of an argument is a program that a user starts."""
+        """Return whether the user starts the program of a controller.
+
+        Args:
+            _argument: argument of its spec.
+        """
         return False
 
     def controller(self) -> Controller:
@@ -158,40 +193,40 @@ class ControllerKind:
         raise NotImplementedError
 
     def driver(self, corridors: int, _simulation: object) -> Driver:
-        """Return a driver for a number of corridors in a simulation of SUMO, or in none (None)."""
+        """Return a driver; its users call `open`.
+
+        Args:
+            corridors: number of corridors.
+            _simulation: the simulation of SUMO in which it drives; None without SUMO.
+        """
         return ControllerArray(corridors, self.controller, self.options.deadline_s)
 
     def release(self) -> None:
         """End the process that loaded it, as its drivers are in other processes."""
 
-    @cached_property
-    def files(self) -> Files:
-        """The files of `code` with their hashes when it was loaded first."""
-        return hashed(self.code)
-
     def with_spec(self, spec: ControllerSpec) -> Self:
-        """Return the same controller with other parameters."""
-        return self._changed(spec, self.options)
+        """Return the same controller with other parameters.
+
+        Args:
+            spec: the same kind and argument with these parameters.
+        """
+        return load_as(type(self), spec, self.options, self.files, *self._more)
 
     def with_log(self, log: Path) -> Self:
-        """Return the same controller, with its output added to a file."""
-        return self._changed(self.spec, replace(self.options, log=log))
+        """Return the same controller with another log; a process that loaded it goes there too.
 
-    def _changed(self, spec: ControllerSpec, options: ControllerOptions) -> Self:
-        changed: Self = _loaded(type(self), spec, options, self.files)
-        return changed
-
-    @property
-    def _values(self) -> tuple[Any, ...]:
-        """The arguments of `_loaded`."""
-        return type(self), self.spec, self.options, self.files
+        Args:
+            log: file to which its output is added.
+        """
+        options = replace(self.options, log=log)
+        return load_as(type(self), self.spec, options, self.files, *self._more)
 
     def __reduce__(self) -> tuple[Callable[..., ControllerKind], tuple[Any, ...]]:
         """Travel to another process as plain values; it is loaded there."""
-        return _loaded, self._values
+        return load_as, (type(self), self.spec, self.options, self.files, *self._more)
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, ControllerKind) and self._values == other._values
+        return isinstance(other, ControllerKind) and self.__reduce__() == other.__reduce__()
 
     def __hash__(self) -> int:
         return hash(self.spec)
@@ -201,7 +236,7 @@ class ControllerKind:
 
         Args:
             corridors: number of corridors.
-            simulation: the simulation of SUMO in which it drives, if there is one.
+            simulation: the simulation of SUMO in which it drives; None without SUMO.
 
         Raises:
             UserError: if the code of the controller has changed since it was loaded first.
@@ -209,16 +244,19 @@ class ControllerKind:
         for name, sha256 in hashed(self.code).items():
             if sha256 not in self.files.values():
                 raise UserError(
-                    f"{printable(name)}, code of the VUT {self.spec}, is not as it was when this "
-                    "began: let it be while it runs, and let all workers have the same"
+                    f"{printable(name)}, code of the VUT {self.spec}, has changed since it was "
+                    "loaded: leave it as it is while it runs, and give all workers the same file"
                 )
         return self.driver(corridors, simulation)
 
     def parameters(self) -> dict[str, float]:
-        """Return the parameters that a spec may set, with their present values.
+        """Return the numbers that its spec may set, by name, with their present values.
 
-        A Python controller is made to tell its attributes. Of SUMO's drivers only those are known
-        that the spec sets. Raises `UserError` for a kind without parameters.
+        A Python controller is made to find its attributes. Of SUMO's drivers only those are known
+        that the spec sets.
+
+        Raises:
+            UserError: for a kind without parameters.
         """
         if self.no_parameters:
             raise UserError(f"{self.spec} has no parameters to change: {self.no_parameters}")
@@ -226,6 +264,33 @@ class ControllerKind:
             return dict(self.settable)
         with closing(self.open(1)) as driver:
             return dict(driver.parameters())
+
+
+K = TypeVar("K", bound=ControllerKind)
+
+
+def load_as(
+    kind: type[K],
+    spec: ControllerSpec,
+    options: ControllerOptions,
+    files: Files | None = None,
+    *more: object,
+) -> K:
+    """Return a controller of a kind.
+
+    Args:
+        kind: the kind.
+        spec: the controller.
+        options: how it is hosted.
+        files: its code with the hashes when it was loaded first; None if this is the first time.
+        *more: further arguments of the kind's constructor.
+
+    Raises:
+        UserError: if it cannot be loaded.
+    """
+    controller = kind(spec, options, *more)
+    controller.files = hashed(controller.code) if files is None else files
+    return controller
 
 
 class FileKind(ControllerKind):
@@ -244,12 +309,20 @@ class FileKind(ControllerKind):
     hosted, asks_sumo = True, False
 
     def __init__(self, spec: ControllerSpec, options: ControllerOptions) -> None:
-        """Import the library and check the file; `UserError` where either cannot be used."""
+        """Import the library and check the file.
+
+        Args:
+            spec: the controller.
+            options: how it is hosted.
+
+        Raises:
+            UserError: if the library or the file cannot be used.
+        """
         super().__init__(spec, options)
         self.path, self.chosen = Path(spec.argument), dict(spec.parameters)
         for name in self.chosen:
             if name not in self.names:
-                raise spec.has_no(name, self.names)
+                raise spec.unknown_parameter(name, self.names)
         try:
             self.api: Any = import_module(self.library)
         except ImportError as error:
@@ -259,16 +332,3 @@ class FileKind(ControllerKind):
             raise UserError(f"{spec}: there is no such file")
         check_code(self.path)
         self.code = (self.path,)
-
-
-def _loaded(
-    kind: type[Any],
-    spec: ControllerSpec,
-    options: ControllerOptions,
-    files: Files,
-    *more: object,
-) -> Any:
-    """Return a controller of a kind whose files had some hashes when it was loaded first."""
-    controller = kind(spec, options, *more)
-    controller.files = files
-    return controller

@@ -78,7 +78,7 @@ class SumoKind(ControllerKind):
         self.settable = chosen = spec.numbers()
         for name, value in chosen.items():
             if name not in known:
-                raise spec.has_no(name, known)
+                raise spec.unknown_parameter(name, known)
             least = -1 if name.startswith("lc") else 0
             if value < least:
                 raise UserError(f"{spec}: {name} is {value}: give a number from {least} up")

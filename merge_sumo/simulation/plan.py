@@ -160,7 +160,7 @@ class SimulationPlan:
         """The reason why cases need SUMO; None if eq. (4) suffices."""
         if self.povs.own is not None:
             return f"the POV {self.povs.own.spec} is not one of this package"
-        if not self.vut.by_arrays:
+        if self.vut.own_code or self.vut.asks_sumo:
             return f"the VUT {self.vut.spec} is not one of this package"
         return None
 

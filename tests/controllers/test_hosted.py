@@ -19,8 +19,8 @@ from support.misbehaviours import STUBBORN
 from support.processes import none_left, wait_for
 from support.scenes import scene_of
 
+from merge_sumo.controllers.child_main import HostRequest, decode_request, encode
 from merge_sumo.controllers.controller import Start
-from merge_sumo.controllers.host import HostRequest, decode_request, encode
 from merge_sumo.controllers.kinds import load
 from merge_sumo.controllers.process import append
 from merge_sumo.controllers.spec import ControllerOptions
@@ -135,7 +135,9 @@ def Vut(seen):
     count.write_text("2")
     factory.open(1).close()
     (tmp_path / "helper.py").write_text("changed = True")
-    with pytest.raises(UserError, match=r"helper\.py, code of the VUT .*, is not as it was"):
+    with pytest.raises(
+        UserError, match=r"helper\.py, code of the VUT .*, has changed since it was loaded"
+    ):
         factory.open(1)
 
 

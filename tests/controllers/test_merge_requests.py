@@ -160,7 +160,7 @@ def test_a_wrong_merge_request_of_a_batch_is_an_error_of_its_own_corridor(write_
 
 def test_a_process_that_forges_merge_requests_loses_its_episodes_and_no_more(write_vut):
     source = """
-from merge_sumo.controllers.host import HostReply, _Host
+from merge_sumo.controllers.child_main import HostReply, _Host
 _Host._act = lambda host, request: HostReply(accelerations_mps2=[1.0, 1.0], merge_requests=[7, 7])
 def Vut(seen):
     return 1.0, True

@@ -218,7 +218,9 @@ def test_its_code_must_stay_as_it_is_while_it_runs(tmp_path, monkeypatch):
     vut = factory(f"traci:{Path(sys.executable).name} -u c.py {{port}} log.txt")
     assert list(vut.files) == ["c.py"], "others are read and written"
     Path("c.py").write_text("print(2)\n", encoding="utf-8")
-    with pytest.raises(UserError, match=r"c\.py, code of the VUT .* is not as it was"):
+    with pytest.raises(
+        UserError, match=r"c\.py, code of the VUT .* has changed since it was loaded"
+    ):
         vut.open(1)
 
 

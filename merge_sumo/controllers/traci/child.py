@@ -33,7 +33,6 @@ from merge_sumo.controllers.traci.protocol import (
 )
 from merge_sumo.controllers.traci.session import NotFiniteError, Session
 from merge_sumo.errors import UserError
-from merge_sumo.files import ScratchFolder
 from merge_sumo.road.road import Road
 from merge_sumo.scenario.scenario import Scenario
 from merge_sumo.sumo.binding import sumo_environment
@@ -85,16 +84,9 @@ class Child(ChildProcess):
         """Start the process; `UserError` if it cannot be started."""
         if os.name != "posix":
             raise UserError("a controller by TraCI needs Linux or macOS")
-        folder = ScratchFolder()
-        write_files(Path(folder.name), road, scenario)
-        super().__init__(
-            f"{__name__}:{main.__name__}",
-            {"folder": folder.name},
-            folder,
-            sumo_environment(),
-            cwd=folder.name,
-            log=Path(os.devnull),  # SUMO's warnings
-        )
+        no_warnings = Path(os.devnull)
+        super().__init__(f"{__name__}:{main.__name__}", {}, sumo_environment(), no_warnings)
+        write_files(Path(self.folder.name), road, scenario)
 
     def request(
         self, action: str, patience_s: float, client: socket.socket | None = None, **values: Any
@@ -128,6 +120,7 @@ def main(settings: Mapping[str, Any]) -> None:
     """Serve clients, one after the other, until the parent ends."""
     limits = {"RLIMIT_DATA": MOST_MEMORY_BYTES, "RLIMIT_FSIZE": MOST_FILE_BYTES}
     connection, server = connected(settings, **limits), Server(Path(settings["folder"]))
+    os.chdir(settings["folder"])
     with suppress(EOFError, OSError):
         while True:
             action, values = msgspec.msgpack.decode(connection.recv_bytes())

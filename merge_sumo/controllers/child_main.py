@@ -1,6 +1,7 @@
-"""The main function of the process that hosts a user's controller, and the messages to it.
+"""The child process that runs a user's controller: its main function and its messages.
 
-Nothing is pickled: a user's code runs in that process, so the messages are data of known types.
+`hosted.py` is the side of the parent. A user's code runs here, so nothing is pickled: messages are
+data of known types.
 """
 
 from __future__ import annotations
@@ -20,16 +21,17 @@ import msgspec
 import numpy as np
 
 from merge_sumo.controllers.controller import ControllerDriver, Start
-from merge_sumo.controllers.deadline import heartbeat, text_of
+from merge_sumo.controllers.deadline import Deadline, text_of
 from merge_sumo.controllers.process import connected
 from merge_sumo.controllers.spec import ControllerKind, ControllerOptions, ControllerSpec
 from merge_sumo.drivers.base import ControllerDiedError, Scene
 from merge_sumo.errors import ControllerError, UserError
+from merge_sumo.printable import printable
 from merge_sumo.scenario.signals import StepSignals
 from merge_sumo.spawning import named
 
 ALIVE_S = 0.25
-"""Least time between two messages that a request proceeds."""
+"""Least time between two messages that a request is being worked on."""
 INSTALLED_FOLDERS = (
     *(sys.prefix, sys.base_prefix, site.getusersitepackages()),
     str(Path(__file__).parents[1]),
@@ -38,13 +40,13 @@ INSTALLED_FOLDERS = (
 
 
 class HostRequest(msgspec.Struct, omit_defaults=True):
-    """Make drivers, let them act, or close them.
+    """Make a driver, let it act, or close it.
 
     Attributes:
-        action: the name of a method of `_Host`.
-        corridors: number of corridors to make drivers for.
-        starts: episodes that begin before the drivers act, by corridor.
-        scene: the scene in which they act.
+        action: the method of `_Host` that replies, without its underscore.
+        corridors: number of corridors of the driver to make.
+        starts: corridors in which an episode begins before the driver acts, with its start.
+        scene: the scene in which the driver acts.
     """
 
     action: Literal["make", "act", "close"]
@@ -54,17 +56,17 @@ class HostRequest(msgspec.Struct, omit_defaults=True):
 
 
 class HostReply(msgspec.Struct, omit_defaults=True):
-    """The reply to a request; also sent when the controller is loaded.
+    """The reply to a request; the first one is sent when the controller is loaded.
 
     Attributes:
         failed: why the request failed; "" where it did not.
         is_finding: whether the code of the controller failed to load.
-        max_corridors: corridors that one driver can serve.
-        files: files of code that were loaded, where they may be others than before.
-        parameters: those of the controllers that were made.
-        accelerations_mps2: answers of the drivers, (K,).
-        merge_requests: their merge requests, (K,).
-        reasons: the errors of answers, by corridor.
+        max_corridors: corridors that one driver can serve; None for any number.
+        files: files of code that were loaded; empty where they are those of the last reply.
+        parameters: present values of the parameters of the driver that was made.
+        accelerations_mps2: answers of the driver, (K,).
+        merge_requests: its merge requests, (K,); None where it made none.
+        reasons: errors of the controllers whose answer is not finite, by corridor.
         signals: signals of the answers, by corridor.
     """
 
@@ -84,11 +86,15 @@ decode_request = msgspec.msgpack.Decoder(
     HostRequest, dec_hook=lambda _, rows: np.array(rows)
 ).decode
 decode_reply = msgspec.msgpack.Decoder(HostReply | None).decode
-"""None says that a request proceeds."""
+"""A reply of None says that the request is still being worked on."""
 
 
 def main(settings: Mapping[str, Any]) -> None:
-    """Host a controller until the connection ends."""
+    """Host a controller until the connection ends.
+
+    Args:
+        settings: those of `ControllerProcess`, with the kind, the spec and the limits.
+    """
     sys.argv[1:] = []
     # Output shortly before a crash must not be lost in a buffer.
     sys.stdout.reconfigure(line_buffering=True)  # type: ignore[union-attr]
@@ -113,7 +119,7 @@ class _Host:
 
     def serve(self) -> None:
         """Load the controller, then answer request by request."""
-        heartbeat.append(self._beat)
+        Deadline.before_call = self._beat
         request = HostRequest("make")
         self._reply(request, self._load)
         while request.action != "close":
@@ -125,9 +131,8 @@ class _Host:
         try:
             reply = action(request)
         except (UserError, ControllerDiedError) as error:
-            # Names of files may not be valid text.
-            text = str(error).encode(errors="backslashreplace").decode()
-            reply = HostReply(failed=text, is_finding=isinstance(error, ControllerError))
+            failed = printable(str(error))  # names of files may not be valid text
+            reply = HostReply(failed=failed, is_finding=isinstance(error, ControllerError))
         except Exception as error:
             reply = HostReply(failed=f"{type(error).__name__}: {text_of(error)}")
         if os.getpid() != process:
@@ -171,7 +176,7 @@ class _Host:
         return HostReply()
 
     def _beat(self, now_s: float) -> None:
-        """Send None from time to time, as one controller after the other is called."""
+        """Tell the parent from time to time that one controller after the other is called."""
         if now_s - self._alive_s > ALIVE_S:
             self._alive_s = now_s
             self._connection.send_bytes(encode(None))

@@ -1,28 +1,25 @@
-"""A user's controller in a process of its own, so that its faults end no other process.
+"""A user's controller in a child process, so that its faults end no other process.
 
-Each step is a request to that process and its reply. A process that dies, or does not reply in
-time, is killed; the running episodes begin again one by one (`simulation/rollout.py`), so that a
-second death is that of one case.
+This is the side of the parent; `child_main.py` is that of the child.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import Self
 
 import msgspec
 import numpy as np
 
+from merge_sumo.controllers.child_main import HostReply, HostRequest, decode_reply, encode
 from merge_sumo.controllers.controller import ControllerDriver, Start
-from merge_sumo.controllers.host import HostReply, HostRequest, decode_reply, encode
 from merge_sumo.controllers.process import BROKEN, ChildProcess, ProcessDiedError
 from merge_sumo.controllers.spec import ControllerKind, ControllerOptions, ControllerSpec
 from merge_sumo.drivers.base import ControllerDiedError, Driver, Scene
 from merge_sumo.errors import ControllerError, UserError
-from merge_sumo.files import ScratchFolder
 from merge_sumo.scenario.case import FloatArray
 from merge_sumo.scenario.signals import StepSignals, as_signals
 
@@ -30,15 +27,15 @@ SUPPORTED = os.name == "posix"
 """Elsewhere a controller runs in this process."""
 GRACE = 1.5
 GRACE_S = 1.25
-"""The process is killed after GRACE deadlines and GRACE_S seconds: by then it should have ended the
-call by itself."""
+"""A process that has sent nothing for GRACE deadlines and GRACE_S seconds is killed: by then it
+should have ended the call by itself."""
 
 
 class ControllerProcess(ChildProcess):
-    """The process of a controller, which is loaded in it.
+    """The child process of a controller, which is loaded in it.
 
     Attributes:
-        loaded: properties of the controller.
+        loaded: properties of the controller: its code, and how many corridors it serves.
     """
 
     def __init__(
@@ -64,25 +61,34 @@ class ControllerProcess(ChildProcess):
             "deadline_s": options.deadline_s,
             "memory_gib": options.memory_gib,
         }
-        # A process that is killed leaves its temporary files: they are in a folder of ours.
-        folder = ScratchFolder()
         # The order of sets must not be another one in each run.
-        environment = {**os.environ, "PYTHONHASHSEED": "0", "TMPDIR": folder.name}
+        environment = {**os.environ, "PYTHONHASHSEED": "0"}
         super().__init__(
-            "merge_sumo.controllers.host:main", settings, folder, environment, log=options.log
+            "merge_sumo.controllers.child_main:main", settings, environment, options.log
         )
         self.loaded = self._opened()
 
     def make(self, corridors: int) -> HostReply:
-        """Make the controllers of some corridors; raises as the constructor does."""
+        """Make the controllers of some corridors.
+
+        Args:
+            corridors: their number.
+
+        Raises:
+            ProcessDiedError: if the process ended.
+            UserError: if they cannot be made.
+        """
         self.send(encode(HostRequest("make", corridors=corridors)))
         return self._opened()
 
     def request(self, request: HostRequest) -> HostReply:
-        """Return the reply to another request.
+        """Return the reply to a request.
+
+        Args:
+            request: any but to make the controllers.
 
         Raises:
-            ProcessDiedError: if there is none in time, or it is invalid; the process is killed.
+            ProcessDiedError: if none comes in time, or it is invalid; the process is killed.
             UserError: if the request failed, for the controller's reason.
         """
         self.send(encode(request))
@@ -122,7 +128,7 @@ class ControllerProcess(ChildProcess):
 
 
 class HostedKind(ControllerKind):
-    """A controller whose code runs in a process of its own; the first driver takes that process."""
+    """A controller whose code runs in a child process; the first driver takes the process."""
 
     asks_sumo = False
 
@@ -139,37 +145,40 @@ class HostedKind(ControllerKind):
             spec: the controller.
             options: how it is hosted.
             kind: its kind.
-            loaded: its properties.
+            loaded: its properties; None to start the process and load it.
 
         Raises:
             UserError: if it cannot be loaded.
         """
         super().__init__(spec, options)
         self._kind = kind
-        self.no_parameters = kind.no_parameters
         self._process: ControllerProcess | None = None
         if loaded is None:
             self._process = self.process()
             loaded = self._process.loaded
-        self._loaded = loaded
-        self.max_corridors, self.max_workers = loaded.max_corridors, kind.max_workers
-        self.code = paths_of(loaded)
+        self._more = kind, loaded
+        self.no_parameters, self.max_workers = kind.no_parameters, kind.max_workers
+        self.max_corridors, self.code = loaded.max_corridors, paths_of(loaded)
 
-    def __reduce__(self) -> tuple[Callable[..., ControllerKind], tuple[Any, ...]]:
-        """Travel without the process."""
-        load, arguments = super().__reduce__()
-        return load, (*arguments, self._kind, self._loaded)
+    def with_log(self, log: Path) -> Self:
+        """Return the same controller with another log, and hand the process over to it.
 
-    def _changed(self, spec: ControllerSpec, options: ControllerOptions) -> HostedKind:
-        other = HostedKind(spec, options, self._kind, self._loaded)
-        other.files = self.files
-        if spec == self.spec and self._process is not None:
-            other._process, self._process = self._process, None
-            other._process.output.log = options.log
+        Args:
+            log: file to which its output is added.
+        """
+        other = super().with_log(log)
+        other._process, self._process = self._process, None
+        if other._process is not None:
+            other._process.output.log = log
         return other
 
     def driver(self, corridors: int, _simulation: object) -> Driver:
-        """Return a driver that asks the process."""
+        """Return a driver that asks the process.
+
+        Args:
+            corridors: number of corridors.
+            _simulation: not used.
+        """
         return HostedDriver(corridors, self)
 
     def process(self, *, again: bool = True) -> ControllerProcess:
@@ -179,7 +188,7 @@ class HostedKind(ControllerKind):
             again: whether it is started again if it dies, as it may have been killed from outside.
 
         Raises:
-            UserError: if there is none.
+            UserError: if the controller cannot be loaded.
         """
         if self._process is not None:
             process, self._process = self._process, None
@@ -197,10 +206,24 @@ class HostedKind(ControllerKind):
 
 
 class HostedDriver(ControllerDriver):
-    """Passes each step on to the process of a controller."""
+    """Passes each step on to the child process of a controller.
+
+    A process that dies, or sends nothing in time, is a `ControllerDiedError`: `Rollout.begin_again`
+    runs the running episodes again, one at a time, each in a new process, so that a second death
+    has one case. The error of a call is a reason of the reply: `ControllerArray` says how it
+    travels.
+    """
 
     def __init__(self, corridors: int, kind: HostedKind) -> None:
-        """Make the controllers in their process; `UserError` where that fails."""
+        """Make the controllers in their process.
+
+        Args:
+            corridors: number of corridors.
+            kind: the controller.
+
+        Raises:
+            UserError: if they cannot be made.
+        """
         super().__init__(corridors)
         self._kind = kind
         self._starts: list[tuple[int, Start]] = []
@@ -209,54 +232,60 @@ class HostedDriver(ControllerDriver):
         self._process = self._opened()
 
     def reset(self, corridor: int, start: Start) -> None:
-        """Note that an episode begins; the next request has its start."""
+        """Note that an episode begins; the next request has its start.
+
+        Args:
+            corridor: index of the corridor.
+            start: first observation of the episode.
+        """
         self._starts.append((corridor, start))
 
     def act(self, scene: Scene) -> FloatArray:
-        """Return the answers of the controllers; NaN where there is a reason.
+        """Return the answers of the controllers, (K,), m/s2; NaN where there is a reason.
 
-        Raises `ControllerDiedError` where the process died.
+        Args:
+            scene: the state of all corridors.
+
+        Raises:
+            ControllerDiedError: if the process died, or cannot be started again after that.
         """
         request = HostRequest("act", starts=self._starts, scene=scene)
         self._starts = []
         try:
             if not self._process.alive:
                 self._process = self._opened()
-        except UserError as error:  # its files have changed since
-            reason = f"started again: {error}"
-            self._reply = HostReply(reasons=dict.fromkeys(range(self.corridors), reason))
-            return np.full(self.corridors, np.nan)
-        try:
             self._reply = reply = self._process.request(request)
         except (ProcessDiedError, UserError) as error:
             raise ControllerDiedError(str(error)) from None
         self._files.update(paths_of(reply))
-        answers, merge_requests = np.array(reply.accelerations_mps2), reply.merge_requests
-        self._merge_requests = (
-            None if merge_requests is None else np.array(merge_requests, dtype=np.int8)
-        )
-        if (
-            not len(answers)
-            == self.corridors
-            == len(answers if merge_requests is None else merge_requests)
-        ):
-            self._process.kill()
-            raise ControllerDiedError(BROKEN)
+        answers, merge_requests = np.array(reply.accelerations_mps2), None
+        if reply.merge_requests is not None:
+            merge_requests = np.array(reply.merge_requests, dtype=np.int8)
+        for column in (answers, merge_requests):
+            if column is not None and len(column) != self.corridors:
+                self._process.kill()
+                raise ControllerDiedError(BROKEN)
+        self._merge_requests = merge_requests
         return answers
 
     def signals(self) -> Mapping[int, StepSignals]:
         """Return the signals of the last answers, by corridor."""
+        # The process may send any text: it is bounded again.
         signals: dict[int, StepSignals] = {}
         for corridor, left in self._reply.signals.items():
             signals[corridor] = as_signals(left)
         return signals
 
     def parameters(self) -> Mapping[str, float]:
-        """Return the parameters of the controller, as they were when it was made."""
+        """Return the parameters of the first controller, as they were when it was made."""
         return self._parameters
 
     def reason(self, corridor: int) -> str | None:
-        """Return the error of the controller of a corridor."""
+        """Return the error of the controller of a corridor; None without one.
+
+        Args:
+            corridor: index of the corridor.
+        """
         return self._reply.reasons.get(corridor)
 
     def files(self) -> tuple[Path, ...]:
@@ -279,5 +308,9 @@ class HostedDriver(ControllerDriver):
 
 
 def paths_of(reply: HostReply) -> tuple[Path, ...]:
-    """Return the files of a reply."""
+    """Return the files of a reply.
+
+    Args:
+        reply: a reply of the process.
+    """
     return tuple(map(Path, map(os.fsdecode, reply.files)))
