@@ -83,7 +83,7 @@ from merge_sumo.reports.junit import JUNIT, check_junit, write_junit, write_juni
 from merge_sumo.reports.progress import Bars, CampaignBars, Counter
 from merge_sumo.reports.report import RunningReport, check_report, write_report
 from merge_sumo.result import Shown
-from merge_sumo.road.scenario_file import SUFFIX, spoken_name
+from merge_sumo.road.scenario_file import SUFFIX, name_in_commands
 from merge_sumo.scenario.case import outside_of_the_pool
 from merge_sumo.scenario.scenario import (
     LEVELS,
@@ -621,7 +621,7 @@ def notice_povs(settings: CampaignSettings, plan: SimulationPlan, config: c.Camp
         )
     if {1, 2} & set(settings.levels) and unseen(settings.scenario, plan.povs.policies):
         scenario = config.scenario or US23
-        name = spoken_name(scenario) if isinstance(scenario, Scenario) else str(scenario)
+        name = name_in_commands(scenario) if isinstance(scenario, Scenario) else str(scenario)
         option = "" if config.policies is None else f" --policies {quoted(config.policies)}"
         check = f"`merge-sumo scenario check {quoted(name or '')}{option}`"
         notice(

@@ -1,11 +1,10 @@
-"""Finding the merge in a net that sumolib reads: where two sequences of edges come to one lane.
+"""Find the merge in a net: the first lane that two sequences of edges have in common.
 
-Where a lane ends from which no connection leads on, the driver changes to the lane next to it. The
-path then crosses the junction next to the connection of that lane, as if the net had a connection
-of its own for it, and M is after the junction, where it is in a net that has one.
+A driver on a lane that ends changes to the lane next to it. The path crosses the junction next to
+the connection of that lane, and M is after the junction, as in a net with a connection of its own.
 
-A scenario with an acceleration lane says where M is along it: the paths become one where the lane
-ends, at a coordinate above 0, and before that they run side by side, on lanes of the same edges.
+An acceleration lane of a scenario ends at a coordinate above 0. There the paths become one; before,
+they are side by side, on lanes of the same edges.
 """
 
 from __future__ import annotations
@@ -48,8 +47,10 @@ VISIBILITY = "visibility"
 POINT_M = 1e-6
 """Length at which a lane is drawn that the file draws as a point."""
 NAME_LAST = "name the edge after the merge point as the last one of both"
+INVALID = (AttributeError, IndexError, KeyError, TypeError, ValueError)
+"""Errors of sumolib where a value of a net is missing or wrong."""
 MAINLINE, RAMP = 0, 1
-"""Places of the paths in pairs."""
+"""Indices of the paths in pairs."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,6 +61,10 @@ class RoadNet:
         path: the file.
         sha256: hash of its unpacked bytes: a packed net is the same road.
         net: its content, a `sumolib.net.Net`.
+
+    Example:
+        >>> read_net(default_net_path()).edges
+        ['main_in', 'main_out', 'ramp']
     """
 
     path: Path
@@ -68,19 +73,19 @@ class RoadNet:
 
     @property
     def edges(self) -> list[str]:
-        """Ids of the edges outside of junctions."""
+        """Ids of the edges outside of junctions, sorted."""
         return sorted(edge.getID() for edge in self.net.getEdges(withInternal=False))
 
 
 def read_net(path: Path, content: bytes | None = None) -> RoadNet:
     """Read a net with sumolib.
 
-    sumolib gets the elements that `parse_xml` has checked and not the file, of which it would
-    resolve the entities.
+    sumolib gets the elements that `parse_xml` has checked and not the file, because it would
+    resolve the entities of a file.
 
     Args:
         path: the net file.
-        content: its unpacked bytes, where they are read already.
+        content: its unpacked bytes; None to read them from the file.
 
     Returns:
         The net.
@@ -108,13 +113,13 @@ def _feed(reader: Any, element: etree._Element, path: Path) -> None:
     try:
         reader.startElement(element.tag, element.attrib)
         if element.tag == "connection" and VISIBILITY in element.attrib:
-            # sumolib leaves out this attribute, and keeps parameters.
+            # sumolib ignores this attribute, and keeps parameters.
             visibility = float(element.attrib[VISIBILITY])
             reader.startElement("param", {"key": VISIBILITY, "value": visibility})
         for child in element:
             _feed(reader, child, path)
         reader.endElement(element.tag)
-    except (AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
+    except INVALID as error:
         raise UserError(
             f"{path} is not a valid SUMO net: <{element.tag}> in line {element.sourceline} has a "
             f"missing or wrong value ({error!r:.200})"
@@ -132,17 +137,18 @@ def find_road(
 ) -> Road:
     """Find the merge of two sequences of edges in a net.
 
-    Both name the edge on which the paths become one, and may continue after it. Equal sequences are
-    one path.
+    Both sequences name the edge on which the paths become one, and may continue after it. Equal
+    sequences are one path.
 
     Args:
         road_net: the net.
-        mainline: edges of the mainline.
-        ramp: edges of the ramp.
-        room_after_m: where the file ends nearer after M, the last lane is continued straight on.
-        edge_at_m: the edge of a single path that begins at M, by default its last one.
-        lane_m: where a scenario has its acceleration lane: that of the road ends with it, and may
-            begin before it.
+        mainline: ids of the edges of the mainline, in driving order.
+        ramp: ids of the edges of the ramp, in driving order.
+        room_after_m: minimum length after M, in m. Where the file ends before, the last lane is
+            continued straight on.
+        edge_at_m: the edge of a single path that begins at M; None for its last one.
+        lane_m: begin and end of the acceleration lane of a scenario, in m. The lane of the road
+            ends there, and may begin before. None where M is the only place to merge.
 
     Returns:
         The road.
@@ -150,12 +156,19 @@ def find_road(
     Raises:
         UserError: an edge is unknown, a sequence is not connected, the paths never meet, or the
             road has no such lane.
+
+    Example:
+        >>> net = read_net(default_net_path())
+        >>> find_road(net, ["main_in", "main_out"], ["ramp", "main_out"]).ramp.before_m
+        425.0
     """
     edges = tuple(mainline), tuple(ramp)
     try:
         return _road(road_net, edges, edge_at_m, room_after_m, lane_m)
     except UserError as error:
         raise UserError(f"the net {road_net.path} cannot host a merge: {error}") from error
+    except INVALID as error:
+        raise UserError(f"{road_net.path} is not a valid SUMO net ({error!r:.200})") from error
 
 
 class _Link(NamedTuple):
@@ -168,13 +181,14 @@ class _Link(NamedTuple):
     state: str
     """SUMO's letter for the right of way: "M" goes first, "m" yields, "Z" is a zipper."""
     visibility_m: float | None
-    """From how far its driver sees the others, where the net says so."""
+    """From how far its driver sees the others; None where the net does not say so."""
     connection: SumoConnection = None
 
 
 _Edges = tuple[str, ...]
-_Layer = dict[SumoLane, list[_Link]]
-"""Lanes of an edge that a path can reach, each with the links that lead to it."""
+_Layer = dict[SumoLane, Any]
+"""Lanes of an edge that a path can reach, each with the straightest `_Link` that leads to it; None
+on the first edge."""
 _Pieces = tuple[list[Piece], list[Piece]]
 """Lanes of mainline and ramp."""
 
@@ -185,8 +199,8 @@ class _Meeting(NamedTuple):
     links: tuple[_Link, _Link]
     ending: int | None
     """The path of which a lane ends there."""
-    place: int
-    """Of the edge of the common lane, among the edges that follow on both paths."""
+    edge: int
+    """Index of the edge of the common lane, from the end of both paths: -1 is the last edge."""
 
 
 def _road(
@@ -201,27 +215,21 @@ def _road(
     for name in chain(*edges):
         _check_edge(road_net, name)
     own, tail = _split(*edges, edge_at_m)
-    main_layers = _layers(net, own[MAINLINE] + tail, len(own[MAINLINE]))
-    ramp_layers = _layers(net, own[RAMP] + tail, len(own[RAMP]))
-    on_main, on_ramp = len(own[MAINLINE]), len(own[RAMP])
-    meeting = _meeting(net, tail, (main_layers[on_main:], ramp_layers[on_ramp:]))
+    layers = []
+    for before in own:
+        layers.append(_layers(net, before + tail, len(before)))
+    meeting = _meeting(net, tail, layers)
     main_link, ramp_link = meeting.links
-    main = _lanes_before(main_layers[: on_main + meeting.place], main_link)
-    ramp = _lanes_before(ramp_layers[: on_ramp + meeting.place], ramp_link)
-    onward = _onward(net, ramp_link.target, tail[meeting.place :])
-    apart, along = _acceleration_lane(main, ramp)
-    lane = _lane_of_road(net, meeting, along, lane_m)
+    main = _lanes_before(layers[MAINLINE][: meeting.edge], main_link)
+    ramp = _lanes_before(layers[RAMP][: meeting.edge], ramp_link)
+    onward = _onward(net, ramp_link.target, tail[meeting.edge :])
+    apart, along = _side_by_side(main, ramp)
+    lane = _acceleration_lane(net, meeting, along, lane_m)
+    begin_m = end_m = 0.0
     if lane_m is None:
-        begin_m = end_m = 0.0
         apart, along = ([*main, *main_link.via], [*ramp, *ramp_link.via]), ([], [])
-    elif lane is None:
-        raise UserError(
-            "ramp and mainline meet in one point, without a lane of the ramp side by side: leave "
-            "lane_m out"
-        )
     else:
-        _check_window(lane, lane_m)
-        begin_m, end_m = lane.begin_m, lane.end_m
+        begin_m, end_m = _window(lane, lane_m)
         onward = [*main_link.via, *onward]
     placed = []
     for own_lanes, side_lanes in zip(apart, along, strict=True):
@@ -229,7 +237,7 @@ def _road(
         pieces += _placed(side_lanes, begin_m, pieces[-1])
         shared = _placed(_continued(onward, room_after_m - end_m), end_m, pieces[-1])
         placed.append(LanePath((*pieces, *shared)))
-    junction = _junction(ramp_link.source)
+    junction = ramp_link.source.getEdge().getToNode()
     return Road(
         path=road_net.path,
         sha256=road_net.sha256,
@@ -249,44 +257,29 @@ def _road(
 
 
 def _surroundings(
-    net: SumoNet, place: Point, paths: Sequence[LanePath]
+    net: SumoNet, at_m: Point, paths: Sequence[LanePath]
 ) -> tuple[tuple[Point, ...], ...]:
-    """Return the shapes of lanes that are not in the paths and begin or end near a point."""
+    """Return the shapes of lanes for cars that are near M and not in the paths."""
     used = {piece.lane for path in paths for piece in path.pieces}
-    roads: list[tuple[Point, ...]] = []
-    internal: list[tuple[Point, ...]] = []
-    for edge in net.getEdges(withInternal=True):
-        if edge.getFunction() in ("crossing", "walkingarea"):
-            continue
-        shapes = internal if edge.isSpecial() else roads
-        for index, lane in enumerate(edge.getLanes()):
-            ends = lane.getShape3D()[:1] + lane.getShape3D()[-1:]
-            is_near = any(math.dist(end, place) <= SURROUNDINGS_M for end in ends)
-            if is_near and f"{edge.getID()}_{index}" not in used:
+    shapes = []
+    for edge in net.getEdges():
+        for lane in _lanes(net, edge.getID()):
+            points = lane.getShape3D()
+            is_near = any(math.dist(point, at_m) <= SURROUNDINGS_M for point in points)
+            if is_near and lane.getID() not in used:
                 shapes.append(_shape(lane))
-    return (*roads, *internal)
-
-
-def _junction(lane: SumoLane) -> Any:
-    """Return the junction at the end of a lane."""
-    junction = lane.getEdge().getToNode()
-    if junction is None or junction.getType() is None:
-        raise UserError(f"there is no junction at the end of lane {lane.getID()}")
-    return junction
+    return tuple(shapes)
 
 
 def _approach(junction: Any, meeting: _Meeting, path: int) -> Approach:
-    """Return how a path comes to the junction, where it meets the other one."""
+    """Return how a path comes to the junction at which it meets the other one."""
     link, other = meeting.links[path], meeting.links[1 - path]
     if meeting.ending is not None:
         yields = path == meeting.ending
     elif junction.getType().startswith("traffic_light"):
         yields = path == RAMP
     else:
-        try:
-            yields = junction.forbids(other.connection, link.connection)
-        except (IndexError, KeyError) as error:
-            raise UserError(f"junction {junction.getID()} has no right of way") from error
+        yields = junction.forbids(other.connection, link.connection)
     return Approach(link.state, yields, link.visibility_m)
 
 
@@ -294,19 +287,19 @@ def _check_edge(road_net: RoadNet, name: str) -> None:
     """Raise `UserError` where a net has no such edge, or cars may not drive there."""
     net = road_net.net
     if not net.hasEdge(name) or net.getEdge(name).isSpecial():
-        hint = meant(name, road_net.edges, 0.5).strip()  # ids of edges are short
-        raise UserError(f"it has no edge {name}{': ' if hint else ''}{hint}")
+        hint = meant(name, road_net.edges, 0.5)  # ids of edges are short
+        raise UserError(f"it has no edge {name}: {hint}name edges of the net")
     if not _lanes(net, name):
         raise UserError(f"no lane of edge {name} is open to cars")
 
 
-def _allows_cars(found: SumoLane | SumoConnection) -> bool:
+def _allows_cars(element: SumoLane | SumoConnection) -> bool:
     # To sumolib "all" is one more class.
-    return bool(found.allows("passenger") or found.allows("all"))
+    return bool(element.allows("passenger") or element.allows("all"))
 
 
 def _lanes(net: SumoNet, edge: str) -> list[SumoLane]:
-    """Return the lanes of an edge on which cars may drive."""
+    """Return the lanes of an edge on which cars may drive, from the right."""
     return [lane for lane in net.getEdge(edge).getLanes() if _allows_cars(lane)]
 
 
@@ -329,7 +322,7 @@ def _piece(lane: SumoLane) -> Piece:
 
 
 def _links(net: SumoNet, source: SumoLane, to_edge: str) -> list[_Link]:
-    """Return the links of a lane to the lanes of an edge, as far as cars may drive there."""
+    """Return the links of a lane to the lanes of an edge on which cars may drive."""
     links = []
     for found in source.getOutgoing():
         target = found.getToLane()
@@ -343,23 +336,18 @@ def _via(net: SumoNet, connection: SumoConnection) -> tuple[Piece, ...]:
     """Return the internal lanes of a connection; there are two where drivers wait inside."""
     pieces: dict[str, Piece] = {}
     while (name := connection.getViaLaneID()) and name not in pieces:
-        try:
-            lane = net.getLane(name)
-        except (IndexError, KeyError, ValueError) as error:
-            raise UserError(f"a connection leads over lane {name}, which is not there") from error
+        lane = net.getLane(name)
         pieces[name] = _piece(lane)
-        if not lane.getOutgoing():
-            break
         connection = lane.getOutgoing()[0]
     return tuple(pieces.values())
 
 
-def _acceleration_lane(main: list[Piece], ramp: list[Piece]) -> tuple[_Pieces, _Pieces]:
-    """Return the lanes of both paths before an acceleration lane, and those side by side along it.
+def _side_by_side(main: list[Piece], ramp: list[Piece]) -> tuple[_Pieces, _Pieces]:
+    """Return the lanes of both paths before an acceleration lane, and those along it.
 
-    There are none of the second kind where the paths come to M without such a lane. The ramp's get
-    the length of the mainline's, from which they differ a little inside of junctions and where a
-    net says so: both have one coordinate.
+    There are none of the second kind where the paths come to M without such a lane. Both paths have
+    one coordinate along it, so the lanes of the ramp get the length of those of the mainline, from
+    which they differ a little inside of junctions and where a net says so.
     """
     on_main, on_ramp = len(main), len(ramp)
     for one, other in zip(_roads(main), _roads(ramp), strict=False):
@@ -376,12 +364,12 @@ def _acceleration_lane(main: list[Piece], ramp: list[Piece]) -> tuple[_Pieces, _
 
 
 def _roads(pieces: list[Piece]) -> list[int]:
-    """Return the numbers of the pieces outside of junctions, the last one first."""
-    numbers = range(len(pieces) - 1, -1, -1)
-    return [number for number in numbers if not pieces[number].is_internal]
+    """Return the indices of the pieces outside of junctions, the last one first."""
+    indices = range(len(pieces) - 1, -1, -1)
+    return [index for index in indices if not pieces[index].is_internal]
 
 
-def _lane_of_road(
+def _acceleration_lane(
     net: SumoNet, meeting: _Meeting, along: _Pieces, lane_m: Bounds | None
 ) -> AccelerationLane | None:
     """Return the acceleration lane of a road: it ends with that of a scenario, or at the junction.
@@ -409,8 +397,13 @@ def _lane_of_road(
     )
 
 
-def _check_window(lane: AccelerationLane, lane_m: Bounds) -> None:
-    """Raise `UserError` where the lane of a scenario begins before that of the road."""
+def _window(lane: AccelerationLane | None, lane_m: Bounds) -> Bounds:
+    """Return begin and end of the lane of a road that has the lane of a scenario."""
+    if lane is None:
+        raise UserError(
+            "ramp and mainline meet in one point, without a lane of the ramp side by side: leave "
+            "lane_m out"
+        )
     begin_m, end_m = lane_m
     if begin_m < lane.begin_m:
         low, high = lane_around_m(lane.length_m)
@@ -418,6 +411,7 @@ def _check_window(lane: AccelerationLane, lane_m: Bounds) -> None:
             f"lane_m is {begin_m:g} to {end_m:g}, {end_m - begin_m:g} m, and the acceleration lane "
             f"is {lane.length_m:.1f} m long: write lane_m = [{low:.1f}, {high:.1f}]"
         )
+    return lane.begin_m, lane.end_m
 
 
 def _split(
@@ -444,8 +438,8 @@ def _split(
             )
     if on_main == 0 or on_ramp == 0:
         raise UserError(
-            f"the {'mainline' if on_main == 0 else 'ramp'} begins with edge {common}, which the "
-            "other path uses too: name an edge before it"
+            f"mainline or ramp begins with edge {common}, which the other path uses too: name an "
+            "edge before it"
         )
     return (mainline[:on_main], ramp[:on_ramp]), max(tails, key=len)
 
@@ -453,41 +447,45 @@ def _split(
 def _layers(net: SumoNet, edges: _Edges, common: int) -> list[_Layer]:
     """Return the lanes that a path can reach on each of its edges.
 
-    A lane of its own must lead to edge number `common`; after that its lanes may end.
+    Args:
+        net: the net.
+        edges: ids of the edges of the path.
+        common: number of edges before the first that the paths share. A lane must lead to that one;
+            after it all lanes may end.
     """
-    layers: list[_Layer] = [{lane: [] for lane in _lanes(net, edges[0])}]
+    layers: list[_Layer] = [dict.fromkeys(_lanes(net, edges[0]))]
     for number, (edge, following) in enumerate(pairwise(edges), start=1):
         layer: _Layer = {}
         for lane in layers[-1]:
             for link in _links(net, lane, following):
-                layer.setdefault(link.target, []).append(link)
+                straightest = layer.get(link.target, link)
+                layer[link.target] = min(straightest, link, key=_swerve)
         if not layer and number <= common:
             raise UserError(f"edge {edge} does not lead to edge {following}: name those in between")
         layers.append(layer)
     return layers
 
 
-def _meeting(net: SumoNet, tail: _Edges, layers: tuple[list[_Layer], list[_Layer]]) -> _Meeting:
+def _meeting(net: SumoNet, tail: _Edges, layers: list[list[_Layer]]) -> _Meeting:
     """Return the meeting of the paths: by connections, or where a lane of one of them ends.
 
     Args:
         net: the net.
-        tail: the edges that follow on both paths.
-        layers: for each of these the lanes that mainline and ramp can reach.
+        tail: ids of the edges that follow on both paths.
+        layers: the lanes that mainline and ramp can reach, by path and edge.
 
     Raises:
         UserError: they have no lane in common.
     """
-    for place, edge in enumerate(tail):
-        main, ramp = layers[MAINLINE][place], layers[RAMP][place]
+    for index, edge in enumerate(tail, start=-len(tail)):
+        main, ramp = layers[MAINLINE][index], layers[RAMP][index]
         for lane in _lanes(net, edge):
             if lane in main and lane in ramp:
-                links = min(main[lane], key=_swerve), min(ramp[lane], key=_swerve)
-                return _Meeting(links, None, place)
-        if place > 0:
-            found = _lane_drop(net, (layers[MAINLINE][place - 1], layers[RAMP][place - 1]), edge)
-            if found is not None:
-                return _Meeting(*found, place)
+                return _Meeting((main[lane], ramp[lane]), None, index)
+        if index > -len(tail):
+            drop = _lane_drop(net, (layers[MAINLINE][index - 1], layers[RAMP][index - 1]), edge)
+            if drop is not None:
+                return _Meeting(*drop, index)
     raise UserError(
         f"mainline and ramp have no lane in common up to the end of edge {tail[-1]}: {NAME_LAST}"
     )
@@ -498,8 +496,13 @@ def _lane_drop(
 ) -> tuple[tuple[_Link, _Link], int] | None:
     """Return the links of both paths where a lane of one ends next to a lane of the other.
 
-    The number is that of the path whose lane ends. `following` is the edge after that on which it
-    ends; None where no such lane ends.
+    Args:
+        net: the net.
+        layers: the lanes that mainline and ramp can reach on an edge.
+        following: id of the next edge.
+
+    Returns:
+        The links, and the path whose lane ends; None where no such lane ends.
     """
     for ending in (RAMP, MAINLINE):
         for last, neighbour in product(layers[ending], layers[1 - ending]):
@@ -513,13 +516,13 @@ def _lane_drop(
 
 def _change(last: SumoLane, neighbour: _Link) -> _Link:
     """Return the link from a lane that ends to the target of a link of the lane next to it."""
-    via = list(neighbour.via[:1])
+    via = neighbour.via
     if via:
         ends = last.getShape3D()[-1], neighbour.target.getShape3D()[0]
-        via = [replace(via[0], length_m=_length_m(neighbour.via), shape=_corners(ends))]
-    state = "Z" if _junction(last).getType() == "zipper" else "m"
+        via = (replace(via[0], length_m=_length_m(via), shape=_corners(ends)),)
+    state = "Z" if last.getEdge().getToNode().getType() == "zipper" else "m"
     # A driver on it sees all along the lane next to it.
-    return _Link(last, neighbour.target, tuple(via), state, visibility_m=last.getLength())
+    return _Link(last, neighbour.target, via, state, visibility_m=last.getLength())
 
 
 def _swerve(link: _Link) -> tuple[int, int]:
@@ -533,14 +536,14 @@ def _lanes_before(layers: list[_Layer], last: _Link) -> list[Piece]:
     lane = last.source
     pieces = [_piece(lane)]
     for layer in layers[:0:-1]:
-        link = min(layer[lane], key=_swerve)
+        link = layer[lane]
         lane = link.source
         pieces = [_piece(lane), *link.via, *pieces]
     return pieces
 
 
 def _onward(net: SumoNet, lane: SumoLane, edges: _Edges) -> list[Piece]:
-    """Return the lanes from one on along edges, the first of which it is on, as far as they go."""
+    """Return the lanes from one on along edges, as far as they go; it is on the first edge."""
     longest: list[Piece] = []
     links = _links(net, lane, edges[1]) if len(edges) > 1 else []
     for link in sorted(links, key=_swerve):
@@ -555,13 +558,18 @@ def _continued(pieces: list[Piece], length_m: float) -> list[Piece]:
     if missing_m <= 0.0:
         return pieces
     last = pieces[-1]
-    before, end = last.shape[-2:]
     # As SUMO draws the lane: a metre of it is this long in the plane.
     drawn_m = missing_m * sum(math.dist(a, b) for a, b in pairwise(last.shape)) / last.length_m
-    share = drawn_m / math.dist(before, end)
-    x, y, z = (e + share * (e - b) for b, e in zip(before, end, strict=True))
-    longer = replace(last, length_m=last.length_m + missing_m, shape=(*last.shape, (x, y, z)))
-    return [*pieces[:-1], longer]
+    shape = (*last.shape, _ahead(last.shape[-1], last.shape, drawn_m))
+    return [*pieces[:-1], replace(last, length_m=last.length_m + missing_m, shape=shape)]
+
+
+def _ahead(point: Point, shape: tuple[Point, ...], length_m: float) -> Point:
+    """Return the point at a distance from another one, in the direction in which a shape ends."""
+    begin, end = shape[-2:]
+    share = length_m / math.dist(begin, end)
+    x, y, z = (at + share * (e - b) for at, b, e in zip(point, begin, end, strict=True))
+    return x, y, z
 
 
 def _length_m(pieces: Iterable[Piece]) -> float:
@@ -569,16 +577,19 @@ def _length_m(pieces: Iterable[Piece]) -> float:
 
 
 def _placed(pieces: Iterable[Piece], start_m: float, before: Piece | None = None) -> list[Piece]:
-    """Return pieces one after the other from a coordinate on; `before` is the piece before them."""
+    """Return pieces one after the other from a coordinate on.
+
+    Args:
+        pieces: lanes of a path.
+        start_m: lane coordinate of the first one.
+        before: the piece before them. A lane inside of a junction that is drawn as a point gets the
+            direction of the piece before it.
+    """
     placed = []
     for piece in pieces:
         shape = piece.shape
         if len(shape) == 1 and before is not None:
-            # Drawn as a point, as some lanes inside of junctions: it points where the last one did.
-            (x0, y0, _), (x1, y1, _) = before.shape[-2:]
-            ahead = POINT_M / math.dist(*before.shape[-2:])
-            x, y, z = shape[0]
-            shape = (*shape, (x + ahead * (x1 - x0), y + ahead * (y1 - y0), z))
+            shape = (*shape, _ahead(shape[0], before.shape, POINT_M))
         before = replace(piece, start_m=start_m, shape=shape)
         placed.append(before)
         start_m += piece.length_m

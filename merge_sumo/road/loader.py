@@ -1,9 +1,10 @@
-"""The road of a scenario: read from a net file as data, and found once in a process."""
+"""Load the road of a net file or of a scenario, once in a process."""
 
 from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -14,37 +15,34 @@ from merge_sumo.metrics.bodies import CentreLines
 from merge_sumo.road.finder import find_road, read_net
 from merge_sumo.road.road import Road
 from merge_sumo.road.xml_input import read_xml
-from merge_sumo.scenario.scenario import ROOM_AFTER_M, Bounds, Scenario
-
-MAINLINE_EDGES = ("main_in", "main_out")
-RAMP_EDGES = ("ramp", "main_out")
-"""Of the shipped net."""
+from merge_sumo.scenario.scenario import ROOM_AFTER_M, US23, Bounds, Scenario
 
 _found: dict[tuple[object, ...], Road] = {}
 
 
 def default_net_path() -> Path:
-    """Return the path of the shipped net."""
+    """Return the path of the net of the paper's scenario, which the package brings."""
     return resource("sumo_net") / "us23.net.xml"
 
 
 def road_of(
     net: Path | None = None,
-    mainline: Sequence[str] = MAINLINE_EDGES,
-    ramp: Sequence[str] = RAMP_EDGES,
+    mainline: Sequence[str] = US23.mainline,
+    ramp: Sequence[str] = US23.ramp,
     room_after_m: float = ROOM_AFTER_M,
     lane_m: Bounds | None = None,
 ) -> Road:
-    """Return the merge of two sequences of edges in a net file, by default the shipped one.
+    """Return the merge of two sequences of edges in a net file.
 
-    A road that was found is kept until the file changes.
+    The road is kept in memory until the file changes.
 
     Args:
-        net: the net file.
-        mainline: edges of the mainline in driving order, past M.
-        ramp: edges of the ramp in driving order, past M.
-        room_after_m: where the file ends nearer after M, the road goes straight on.
-        lane_m: begin and end of the acceleration lane of a scenario.
+        net: the net file; None for that of the paper's scenario.
+        mainline: ids of the edges of the mainline in driving order, past M.
+        ramp: ids of the edges of the ramp in driving order, past M.
+        room_after_m: minimum length after M, in m. Where the file ends before, the road continues
+            straight on.
+        lane_m: begin and end of the acceleration lane of a scenario, in m; None for a merge at M.
 
     Returns:
         The road.
@@ -65,8 +63,18 @@ def road_of(
 def road_for(scenario: Scenario) -> Road:
     """Return the road of a scenario.
 
+    Args:
+        scenario: names the net and the edges of both paths.
+
+    Returns:
+        The road, with the acceleration lane of the scenario.
+
     Raises:
-        UserError: there is no such merge, or a path is shorter before M than its farthest start.
+        UserError: the net has no such merge, or a path is shorter before M than its farthest start.
+
+    Example:
+        >>> road_for(US23).ramp.before_m
+        425.0
     """
     # A net without a folder is one of the package.
     net = None if scenario.net is None else resource("sumo_net") / scenario.net
@@ -85,13 +93,14 @@ def road_for(scenario: Scenario) -> Road:
     return road
 
 
-_centre_lines: dict[tuple[object, ...], CentreLines] = {}
-
-
+@cache
 def centre_lines(road: Road) -> CentreLines:
-    """Return the centre lines of both paths of a road; they are found once in a process."""
-    key = road.sha256, road.mainline_edges, road.ramp_edges, road.lane_m
-    if key not in _centre_lines:
-        corners = np.array(road.mainline.corners()), np.array(road.ramp.corners())
-        _centre_lines[key] = CentreLines.of(*corners)
-    return _centre_lines[key]
+    """Return the centre lines of both paths of a road, for bodies of vehicles in the plane.
+
+    Args:
+        road: the road.
+
+    Returns:
+        The lines; the same object for the same road.
+    """
+    return CentreLines.of(np.array(road.mainline.corners()), np.array(road.ramp.corners()))

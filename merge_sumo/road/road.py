@@ -1,12 +1,9 @@
-"""A merge in any SUMO net, as a value: two paths of lanes that become one at M.
+"""The road of a merge: two paths of lanes, mainline and ramp, that become one at M.
 
-Where both vehicles drive on the same lanes all the way, the paths are equal.
-
-Each path has its own coordinate: the distance of the front bumper along its lanes from the merge
-point M, in metres, negative before M. The lanes inside of junctions belong to the paths, so the
-coordinate is continuous, and M is where the first lane begins that both paths have. On a ramp with
-an acceleration lane M is where a merge is expected along it: both lanes have one coordinate there,
-and the paths become one where the acceleration lane ends.
+A lane coordinate is a distance along the lanes of a path from the merge point M, in m, negative
+before M. Lanes inside of junctions belong to the paths, so it is continuous. M is where the first
+common lane of both paths begins. On a road with an acceleration lane M is the expected place of a
+merge along it: ramp and mainline have one coordinate there, and become one at the end of the lane.
 """
 
 from __future__ import annotations
@@ -23,35 +20,48 @@ from merge_sumo.scenario.scenario import Bounds
 Point = tuple[float, float, float]
 
 DRAWN_MIN_M = 0.1
-"""SUMO takes a lane for drawn as long as this when it is drawn shorter, and stops at its end."""
+"""SUMO counts a lane that is drawn shorter as drawn this long, and stops at its end."""
 
 
 class LanePoint(NamedTuple):
-    """The place of a lane coordinate in the net (lane, position on it) and in the plane."""
+    """A point of a path, on its lane and in the plane.
+
+    Attributes:
+        lane: id of the lane.
+        position_m: distance from the begin of the lane.
+        x_m: eastward coordinate in the net.
+        y_m: northward coordinate in the net.
+        angle_deg: heading in SUMO's convention: degrees clockwise from north.
+    """
 
     lane: str
     position_m: float
     x_m: float
     y_m: float
     angle_deg: float
-    """Heading in SUMO's convention: degrees clockwise from north."""
 
 
 @dataclass(frozen=True, slots=True)
 class Piece:
-    """A lane of a path, with the coordinate at which it begins."""
+    """A lane of a path.
+
+    Attributes:
+        lane: id in the net file; that of a lane inside of a junction begins with a colon.
+        start_m: lane coordinate of its begin.
+        length_m: length that is driven.
+        speed_limit_mps: speed limit.
+        shape: points (x, y, z) from begin to end, in m; their distance may differ from `length_m`.
+    """
 
     lane: str
-    """Its id in the net file; an internal lane's begins with a colon."""
     start_m: float
     length_m: float
     speed_limit_mps: float
     shape: tuple[Point, ...]
-    """Points in the plane from its begin to its end; drawn length and `length_m` may differ."""
 
     @property
     def shares(self) -> list[float]:
-        """Shares of `length_m` at which the points of the shape are driven over."""
+        """Shares of `length_m` at which the points of the shape are passed, one for each."""
         reach = list(accumulate((math.dist(a, b) for a, b in pairwise(self.shape)), initial=0.0))
         whole = max(reach[-1], DRAWN_MIN_M)
         return [along / whole for along in reach]
@@ -62,7 +72,14 @@ class Piece:
         return self.lane.startswith(":")
 
     def point(self, position_m: float) -> tuple[float, float, float]:
-        """Return (x, y, angle) of a position on the lane, where SUMO draws it."""
+        """Return where SUMO draws a position on the lane.
+
+        Args:
+            position_m: distance from the begin of the lane.
+
+        Returns:
+            x and y in m, and the heading in degrees clockwise from north.
+        """
         # Where the lane is straight this is the share of its length, and nothing is rounded.
         shares = self.shares
         along = min(position_m / self.length_m, shares[-1])
@@ -76,7 +93,13 @@ class Piece:
 
 @dataclass(frozen=True, slots=True)
 class LanePath:
-    """The lanes that a vehicle drives on, one after the other."""
+    """The lanes that a vehicle drives on, in driving order.
+
+    Example:
+        >>> path = road_of().ramp
+        >>> path.before_m, path.point(-10.0).lane
+        (425.0, 'ramp_0')
+    """
 
     pieces: tuple[Piece, ...]
 
@@ -87,26 +110,34 @@ class LanePath:
 
     @property
     def before_m(self) -> float:
-        """Length before M."""
+        """Length before M, in m."""
         return -self.pieces[0].start_m
 
     @property
     def after_m(self) -> float:
-        """Length after M."""
+        """Length after M, in m."""
         return self.pieces[-1].start_m + self.pieces[-1].length_m
 
     def piece(self, x_m: float) -> Piece:
-        """Return the lane at a coordinate."""
+        """Return the lane at a coordinate.
+
+        Args:
+            x_m: lane coordinate. The first lane is taken for those before the path.
+        """
         return self.pieces[max(bisect.bisect_right(self.starts_m, x_m) - 1, 0)]
 
     def point(self, x_m: float) -> LanePoint:
-        """Return the place of a lane coordinate."""
+        """Return the point at a coordinate.
+
+        Args:
+            x_m: lane coordinate, in m.
+        """
         piece = self.piece(x_m)
         position_m = x_m - piece.start_m
         return LanePoint(piece.lane, position_m, *piece.point(position_m))
 
     def corners(self) -> list[tuple[float, float, float]]:
-        """Return the points of the lanes, each with its coordinate: (x_m, x, y)."""
+        """Return the points at which the lanes are drawn: (lane coordinate, x, y), in m."""
         corners = []
         for piece in self.pieces:
             for share, (x, y, _) in zip(piece.shares, piece.shape, strict=True):
@@ -114,18 +145,26 @@ class LanePath:
         return corners
 
     def nearest(self, x_m: float, y_m: float) -> tuple[float, float]:
-        """Return the distance of a point in the plane to the lanes, in m, and the coordinate."""
-        found = []
+        """Return the point of the path that is nearest to a point in the plane.
+
+        Args:
+            x_m: eastward coordinate in the net.
+            y_m: northward coordinate in the net.
+
+        Returns:
+            Distance to the path and lane coordinate, in m.
+        """
+        distances = []
         for (begin_m, x0, y0), (end_m, x1, y1) in pairwise(self.corners()):
             dx, dy = x1 - x0, y1 - y0
             along = ((x_m - x0) * dx + (y_m - y0) * dy) / (dx * dx + dy * dy or 1.0)
             along = min(max(along, 0.0), 1.0)
             away_m = math.hypot(x_m - x0 - along * dx, y_m - y0 - along * dy)
-            found.append((away_m, begin_m + along * (end_m - begin_m)))
-        return min(found)
+            distances.append((away_m, begin_m + along * (end_m - begin_m)))
+        return min(distances)
 
     def speed_limits_mps(self) -> list[tuple[float, float]]:
-        """Return (x_m from where on, limit) wherever the limit of the lanes changes."""
+        """Return (lane coordinate, limit after it) wherever the speed limit changes."""
         limits: list[tuple[float, float]] = []
         for piece in self.pieces:
             if not limits or limits[-1][1] != piece.speed_limit_mps:
@@ -135,35 +174,40 @@ class LanePath:
 
 @dataclass(frozen=True, slots=True)
 class Approach:
-    """The right of way of a path over the junction at M."""
+    """The right of way of a path at the junction at M.
+
+    Attributes:
+        state: SUMO's letter for it, such as "M" for a major and "m" for a minor link.
+        yields: whether the path yields to the other one.
+        visibility_m: distance to the junction from which a driver sees the other path; None where
+            the net does not say so.
+    """
 
     state: str
-    """SUMO's letter for its right of way."""
     yields: bool
-    """Whether the junction's rules make it yield to the other path."""
     visibility_m: float | None
 
 
 EXPECTED_SHARE = 0.35
-"""Of an acceleration lane, up to M: on three German ramps with lanes of 186 to 199 m cars merge
-after a mean share of .32, .46 and .33 (Li et al. 2023, arXiv 2303.11531, 3,430 merges)."""
+"""Share of an acceleration lane before M. On three German ramps with lanes of 186 to 199 m cars
+merge after a mean share of .32, .46 and .33 (Li et al. 2023, arXiv 2303.11531, 3,430 merges)."""
 MIN_LANE_M = 50.0
-"""A shorter lane that the net does not mark leaves no choice: 2 s at 25 m/s."""
+"""Minimum length of a lane that the net does not mark: 2 s at 25 m/s are no choice."""
 MAX_LANE_M = 2000.0
-"""A longer lane is one of the mainline that ends somewhere."""
+"""Maximum length: a longer lane is one of the mainline that ends somewhere."""
 
 
 @dataclass(frozen=True, slots=True)
 class AccelerationLane:
-    """A lane of the ramp that runs next to one of the mainline up to where the paths become one.
+    """A lane of the ramp next to one of the mainline, up to where the paths become one.
 
     Attributes:
         begin_m: lane coordinate of its begin, the gore.
         end_m: lane coordinate of its end.
-        lanes: its ids in the net file, one for each edge.
+        lanes: ids of its lanes in the net file, one for each edge.
         mainline_lanes: ids of the lanes next to it.
-        is_marked: whether the net marks it, as netconvert does.
-        exits: edges after it, other than that of the mainline: weaving traffic leaves there.
+        is_marked: whether the net has the mark of netconvert for acceleration lanes.
+        exits: ids of the edges after it except that of the mainline: weaving traffic leaves there.
     """
 
     begin_m: float
@@ -175,7 +219,7 @@ class AccelerationLane:
 
     @property
     def length_m(self) -> float:
-        """Length next to the mainline."""
+        """Length next to the mainline, in m."""
         return self.end_m - self.begin_m
 
     @property
@@ -186,9 +230,13 @@ class AccelerationLane:
 
 
 def lane_around_m(length_m: float) -> Bounds:
-    """Return begin and end of a lane of a length around the expected merge, at 0.
+    """Return begin and end of an acceleration lane around the expected merge, at 0.
 
-    In tenths of a metre, so it is up to 0.1 m shorter than the lane.
+    Args:
+        length_m: length of the lane.
+
+    Returns:
+        Lane coordinates in tenths of a metre, up to 0.1 m nearer to each other than `length_m`.
     """
     end_m = math.floor((1.0 - EXPECTED_SHARE) * length_m * 10.0) / 10.0
     return math.ceil((end_m - length_m) * 10.0) / 10.0, end_m
@@ -196,44 +244,58 @@ def lane_around_m(length_m: float) -> Bounds:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Road:
-    """A merge in a net: the road for the simulation, replays and exports.
+    """A merge in a net, for simulations, replays and exports.
 
     Example:
         >>> road = road_of()
         >>> road.ramp.point(-10.0).lane
         'ramp_0'
+
+    Attributes:
+        path: the net file.
+        sha256: hash of its unpacked bytes.
+        mainline_edges: ids of the edges of the mainline, in driving order.
+        ramp_edges: ids of the edges of the ramp, in driving order.
+        mainline: lanes of the mainline.
+        ramp: lanes of the ramp, and those after M.
+        junction_type: SUMO's type of the junction at M.
+        mainline_approach: right of way of the mainline at M.
+        ramp_approach: right of way of the ramp at M.
+        lane_drop: whether one path comes to M from a lane that ends.
+        drawn_after_m: length after M in the file; from there the last lane continues straight on.
+        surroundings: shapes of the other lanes near M, for drawings.
+        lane_m: begin and end of the acceleration lane of a scenario, as lane coordinates; None
+            where both paths meet in one point, M.
+        acceleration_lane: that of the road, also where a scenario does not use it.
     """
 
     path: Path
     sha256: str
-    """Hash of the net, unpacked."""
     mainline_edges: tuple[str, ...]
     ramp_edges: tuple[str, ...]
     mainline: LanePath
     ramp: LanePath
     junction_type: str
-    """Of the junction at M."""
     mainline_approach: Approach
     ramp_approach: Approach
     lane_drop: bool
-    """Whether one path comes to M from a lane that ends."""
     drawn_after_m: float
-    """Length after M in the file; from there on the last lane is continued straight on."""
     surroundings: tuple[tuple[Point, ...], ...]
-    """Shapes of the other lanes near M, for drawings."""
     lane_m: Bounds | None = None
-    """Where the acceleration lane begins and ends that a scenario has on this road; None where both
-    paths meet in one point, M."""
     acceleration_lane: AccelerationLane | None = None
-    """That of the road, also where a scenario does not use it."""
 
     @property
     def is_one_path(self) -> bool:
-        """Whether both vehicles drive on one lane all the way."""
+        """Whether mainline and ramp are the same lanes."""
         return self.mainline_edges == self.ramp_edges
 
     def lane_point(self, x_m: float, *, on_ramp: bool) -> LanePoint:
-        """Return the place of a lane coordinate of one of the paths."""
+        """Return the point at a coordinate of one of the paths.
+
+        Args:
+            x_m: lane coordinate, in m.
+            on_ramp: whether the path is the ramp.
+        """
         return (self.ramp if on_ramp else self.mainline).point(x_m)
 
     @property

@@ -1,4 +1,6 @@
-"""Scenarios by name or as files: TOML that says what differs from the paper's scenario.
+"""Scenarios by name or from TOML files, which give the differences from the paper's scenario.
+
+An example of a file:
 
 name = "my-ramp"
 net = "my-ramp.net.xml"          # next to this file
@@ -11,7 +13,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 
 from merge_sumo.errors import UserError
@@ -24,43 +26,57 @@ SUFFIX = ".toml"
 
 
 def shipped_scenarios() -> list[str]:
-    """Return the names of the scenarios that the package brings: its files, and the paper's."""
+    """Return the names of the scenarios of the package, the paper's first."""
     files = sorted(resource("sumo_net").glob(f"*{SUFFIX}"))
     return [US23.name, *(path.stem for path in files)]
 
 
 def named_scenario(name: str) -> Scenario:
-    """Return the scenario of a name or of a file; `UserError` where there is none.
+    """Return a scenario of the package or of a file.
 
-    An error in a file is reported with its line.
+    Args:
+        name: name of a scenario of the package, or path of a TOML file. A file names its net
+            relative to its own folder.
+
+    Returns:
+        The scenario.
+
+    Raises:
+        UserError: no scenario has this name, or the file has an error, which is named by its line.
+
+    Example:
+        >>> named_scenario("us23-lane").lane_m
+        (-70.0, 130.0)
     """
     if name == US23.name:
         return US23
-    if name in shipped_scenarios():
+    known = shipped_scenarios()
+    if name in known:
         return _read(resource("sumo_net") / f"{name}{SUFFIX}")
     if not name.endswith(SUFFIX):
-        known = shipped_scenarios()
         raise UserError(
             f"there is no scenario {name!r}: {meant(name, known)}choose {', '.join(known)}, or a "
             f"file NAME{SUFFIX}"
         )
-    return read_scenario(Path(name))
+    scenario = _read(Path(name))
+    if scenario.net is None:
+        return scenario
+    return replace(scenario, net=str((Path(name).parent / scenario.net).resolve()))
 
 
-def spoken_name(scenario: Scenario) -> str | None:
-    """Return the name of a scenario for commands in this folder; None where they find none."""
+def name_in_commands(scenario: Scenario) -> str | None:
+    """Return the name by which commands in the working folder find a scenario.
+
+    Args:
+        scenario: the scenario.
+
+    Returns:
+        Its name or its file; None where a command finds neither.
+    """
     if scenario.name in shipped_scenarios():
         return scenario.name
     file = f"{scenario.name}{SUFFIX}"
     return file if Path(file).is_file() else None
-
-
-def read_scenario(path: Path) -> Scenario:
-    """Return the scenario that a file describes; its net is found next to the file."""
-    scenario = _read(path)
-    if scenario.net is None:
-        return scenario
-    return replace(scenario, net=str((path.parent / scenario.net).resolve()))
 
 
 def _read(path: Path) -> Scenario:
@@ -73,7 +89,7 @@ def _read(path: Path) -> Scenario:
 
 
 def _line(text: str, sentence: str) -> str:
-    """Return ", line N" of the first key of a file that a sentence begins with or quotes."""
+    """Return ", line N" of the first key in a file that a sentence begins with or quotes."""
     for number, line in enumerate(text.splitlines(), start=1):
         key = re.match(r"\s*([\w-]+)\s*=", line)
         if key and re.search(rf"(^|'){re.escape(key[1])}('| is )", sentence):
@@ -85,42 +101,47 @@ COMMENTS = {
     "net": "the SUMO net, next to this file",
     "mainline": "edges of the mainline in driving order, past the merge point M",
     "ramp": "edges of the ramp in driving order, past M",
-    "x_pov0_m": "where the POV may start: low, high; metres of its front bumper before M",
-    "v_pov0_mps": "how fast it may be then",
-    "x_vut0_m": "where the VUT starts",
-    "v_vut0_mps": "how fast it is then; a range, as in [14.0, 22.0], is tested as a whole",
-    "tau_s": "a car of the mainline follows the one ahead of it with this reaction time,",
-    "min_gap_m": "and this distance at a stand",
+    "x_pov0_m": "starts of the POV: low, high; metres of its front bumper before M",
+    "v_pov0_mps": "its speed at the start: low, high",
+    "x_vut0_m": "start of the VUT",
+    "v_vut0_mps": "its speed there; a range, as in [14.0, 22.0], is tested as a whole",
+    "tau_s": "reaction time with which a car of the mainline follows the car ahead",
+    "min_gap_m": "gap to the car ahead at standstill",
     "pov_length_m": "length of the cars of the mainline",
     "vut_length_m": "length of the VUT",
     "a_min_mps2": "hardest braking of both",
     "a_max_mps2": "hardest acceleration of both",
     "timeout_s": "an episode that has not ended by then is a TIMEOUT",
-    "follow_up_s": "all drive on after the merge for so long",
-    "v_hw_min_mps": "speeds between which the mainline drives",
+    "follow_up_s": "duration of the simulation after the merge",
+    "v_hw_min_mps": "lowest and highest speed of the mainline",
     "v_min_mps": "below this the VUT is slow",
     "ttc_min_s": "a time to collision below this is short",
     "dx_crash_m": "front bumpers nearer than this at the merge: a collision",
     "dx_critical_m": "nearer than this is critical",
-    "level0_a_mps2": "a VUT that does not think accelerates so,",
-    "level0_v_mps": "up to this speed",
-    "reach_m": "no vehicle starts farther from M than this,",
-    "v_start_max_mps": "nor faster than this",
-    "lane_m": "where the acceleration lane begins, at the gore or behind it, and ends",
+    "level0_a_mps2": "acceleration of a level-0 VUT",
+    "level0_v_mps": "speed up to which it accelerates",
+    "reach_m": "no vehicle starts farther from M",
+    "v_start_max_mps": "no vehicle starts faster",
+    "lane_m": "begin of the acceleration lane, at the gore or after it, and its end",
     "lane_end": 'its end moves a VUT to the mainline; "stop" brakes it to a stand before it',
 }
 """Comments on the values of a file that is written."""
 
 
-def to_toml(scenario: Scenario, found: Sequence[str]) -> str:
-    """Return a scenario as a commented file; `found` is what was found out, in lines."""
-    lines = [*(f"# {line}" for line in found), ""]
+def to_toml(scenario: Scenario, notes: Sequence[str]) -> str:
+    """Return a scenario as a commented TOML file.
+
+    Args:
+        scenario: the scenario.
+        notes: lines of a comment at the begin of the file.
+    """
+    lines = [f"# {line}" for line in notes]
+    lines.append("")
     recorded = scenario.to_record()
-    for field in fields(scenario):
-        value = getattr(scenario, field.name)
-        if value is None or field.name not in recorded:
+    for name in recorded:
+        value = getattr(scenario, name)
+        if value is None:
             continue
-        comment = COMMENTS.get(field.name)
-        text = f"{field.name} = {toml_value(value)}"
+        text, comment = f"{name} = {toml_value(value)}", COMMENTS.get(name)
         lines.append(f"{text:<44}# {comment}" if comment else text)
     return "\n".join(lines) + "\n"

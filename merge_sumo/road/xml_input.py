@@ -1,8 +1,7 @@
-"""XML files of others, read as data: without entities and document types, and within limits.
+"""Read XML files of others as data: without entities and document types, and within limits.
 
-SUMO's files can name other files, devices and addresses, and SUMO reads and writes all of them. So
-SUMO gets no file that was received: replays and campaigns write their own net from the data read
-here, and where SUMO needs the whole net it gets `harmless_net`.
+SUMO reads and writes the files, devices and addresses that its input files name. It therefore gets
+no received file, but files that merge-sumo writes from the data read here (`harmless_net`).
 """
 
 from __future__ import annotations
@@ -19,9 +18,9 @@ from merge_sumo.errors import UserError
 from merge_sumo.files import read_limited
 
 MAX_BYTES = 2**28
-"""Of a file, unpacked: the net of a city has 50 MB."""
+"""Maximum size of a file, unpacked. The net of a city has 50 MB."""
 MAX_ELEMENTS = 4_000_000
-"""Of a file: the net of a city has 500,000."""
+"""Maximum number of elements of a file. The net of a city has 500,000."""
 GZIP = b"\x1f\x8b"
 """First bytes of a gzip file."""
 NET_TAGS = frozenset(
@@ -30,24 +29,26 @@ NET_TAGS = frozenset(
         *("tlLogic", "phase"),
     }
 )
-"""Elements of a net that describe the road. None of them names a file but a projection."""
+"""Elements of a net that describe the road. Only a location can name a file, in its projection."""
 RECORD_TAGS = frozenset(("fcd-export", "timestep", "vehicle"))
+"""Elements of floating car data."""
 PROJECTION = re.compile(
     r"[!.-]|(\+(no_defs|south|(proj|zone|ellps|datum|units|lat_0|lat_1|lat_2|lat_ts|lon_0|k|k_0"
     r"|x_0|y_0|type|towgs84)=[\w.,-]{1,80})( |$))+",
     re.ASCII,
 )
-"""Projections that name no file."""
+"""Projections that do not name a file."""
 
 
 def read_xml(path: Path, what: str) -> bytes:
-    """Return the bytes of an XML file, unpacked where it is packed by gzip.
-
-    Every command and every kind of controller reads nets here, so all take the same ones.
+    """Return the bytes of an XML file.
 
     Args:
-        path: the file.
-        what: what messages call it.
+        path: the file, plain or packed by gzip.
+        what: its description in messages, such as "the net".
+
+    Returns:
+        The unpacked content.
 
     Raises:
         UserError: it is not a regular file, cannot be unpacked, or is larger than `MAX_BYTES`.
@@ -68,16 +69,24 @@ def read_xml(path: Path, what: str) -> bytes:
 
 
 def parse_xml(content: bytes, name: str, tags: frozenset[str]) -> etree._Element:
-    """Return the elements of an XML file that have one of the tags, as a tree.
+    """Parse an XML file and keep the elements with some tags.
 
     Args:
-        content: the file.
-        name: what messages call it.
-        tags: the elements that are kept, with the root's.
+        content: the unpacked content of the file.
+        name: its description in messages, such as "the net a.net.xml".
+        tags: the tags to keep. The root is always kept.
+
+    Returns:
+        The root of the tree.
 
     Raises:
-        UserError: it is not UTF-8 or XML, or it has entities, a document type, or more elements
-            than `MAX_ELEMENTS`.
+        UserError: the content is not UTF-8 or not XML, or it has an entity, a document type, or
+            more elements than `MAX_ELEMENTS`.
+
+    Example:
+        >>> root = parse_xml(b'<net><edge id="a"/><param key="b"/></net>', "my net", NET_TAGS)
+        >>> [element.tag for element in root]
+        ['edge']
     """
     try:
         content.decode("utf-8")
@@ -87,7 +96,7 @@ def parse_xml(content: bytes, name: str, tags: frozenset[str]) -> etree._Element
         raise UserError(f"{name} declares a document type or an entity: remove the declaration")
     elements = etree.iterparse(
         io.BytesIO(content),
-        # Another encoding, as the file may declare, could hide a declaration from the search above.
+        # Another encoding, which the file may declare, could hide an entity from the check above.
         encoding="utf-8",
         remove_comments=True,
         remove_pis=True,
@@ -106,23 +115,27 @@ def parse_xml(content: bytes, name: str, tags: frozenset[str]) -> etree._Element
         reason = str(error.msg).encode("ascii", "backslashreplace").decode()
         raise UserError(f"{name} is not readable XML: {reason:.200}") from error
     root: etree._Element = elements.root
-    for element in [element for element in root.iter() if element.tag not in tags]:
-        parent = element.getparent()
-        if parent is not None:
-            parent.remove(element)
+    unwanted = {element.tag for element in root.iter()} - tags
+    etree.strip_elements(root, *unwanted, with_tail=False)
     return root
 
 
 def harmless_net(path: Path) -> etree._Element:
-    """Return the road of a net file, without what could name a file or an address.
+    """Return the road of a net file, without names of files or addresses.
+
+    Args:
+        path: the net file.
+
+    Returns:
+        The root of the net.
 
     Raises:
-        UserError: it cannot be read.
+        UserError: the file cannot be read.
     """
     root = parse_xml(read_xml(path, "the net"), f"the net {path}", NET_TAGS)
     for name in map(str, root.keys()):
         if name.startswith("{"):
-            del root.attrib[name]  # the place of a schema
+            del root.attrib[name]  # the address of a schema
     for location in root.iterfind("location"):
         if not PROJECTION.fullmatch(location.get("projParameter", "!")):
             location.set("projParameter", "!")
@@ -130,6 +143,10 @@ def harmless_net(path: Path) -> etree._Element:
 
 
 def to_bytes(root: etree._Element) -> bytes:
-    """Return a tree as an XML file."""
+    """Return a tree as the content of an XML file.
+
+    Args:
+        root: the root of the tree, which gets indented.
+    """
     etree.indent(root, space="    ")
     return etree.tostring(root, xml_declaration=True, encoding="UTF-8")

@@ -13,6 +13,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from operator import attrgetter
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +25,7 @@ from merge_sumo.metrics.merge import merged_rows
 from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.records import to_json
 from merge_sumo.road.finder import find_road, read_net
-from merge_sumo.road.loader import MAINLINE_EDGES, RAMP_EDGES, road_of
+from merge_sumo.road.loader import road_of
 from merge_sumo.road.road import LanePath, Road
 from merge_sumo.road.xml_input import to_bytes
 from merge_sumo.scenario.case import Case, FloatArray, described
@@ -106,8 +107,9 @@ def write_scenario(folder: Path, road: Road, outcome: Outcome, trajectory: Traje
 
 def _road(road: Road, folder: Path) -> ReplayRoad:
     """Return a road as a folder has it."""
-    edges, shipped = (road.mainline_edges, road.ramp_edges), road_of()
-    if (road.sha256, *edges) == (shipped.sha256, MAINLINE_EDGES, RAMP_EDGES):
+    shipped = road_of()
+    identity = attrgetter("sha256", "mainline_edges", "ramp_edges")
+    if identity(road) == identity(shipped):
         return ReplayRoad(shipped.path.read_bytes(), shipped, NET)
     fast = replace(road, mainline=_fast(road.mainline), ramp=_fast(road.ramp))
     content = hosted_net(fast, 1, lane_goes_on=True)

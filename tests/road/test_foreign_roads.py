@@ -8,12 +8,12 @@ import gzip
 import math
 import re
 from dataclasses import replace
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import pytest
 from lxml import etree
+from shapely import MultiLineString, Point
 from support.foreign_nets import FOREIGN, LANES, foreign_lane_road
 from support.handmade import write_run
 from support.replays import assert_identical, commanded, write_replay
@@ -50,12 +50,12 @@ def test_a_replay_of_any_motion_is_identical_also_after_the_end_of_the_net(
     assert trajectory.x_vut_m[-1] > 0.0
 
 
-def lane_centres(road_file: Path) -> np.ndarray:
-    """Return the centres of all lanes of an OpenDRIVE file as segments, (n, 2, 2).
+def lane_centres(road_file: Path) -> MultiLineString:
+    """Return the centres of all lanes of an OpenDRIVE file.
 
     Reads the straight lines that netconvert writes, with lanes of constant width.
     """
-    segments = []
+    lines = []
     for road in etree.parse(road_file).findall("road"):
         shift = road.find("lanes/laneOffset")
         across = 0.0 if shift is None else float(shift.get("a"))
@@ -70,16 +70,9 @@ def lane_centres(road_file: Path) -> np.ndarray:
                 left = np.array([-ahead[1], ahead[0]])
                 begin = np.array([x, y]) + (across - width / 2.0) * left
                 line += [begin, begin + length * ahead]
-            segments += list(pairwise(line))
+            lines.append(line)
             across -= width
-    return np.array(segments)
-
-
-def distance(segments: np.ndarray, x: float, y: float) -> float:
-    begin, along = segments[:, 0], segments[:, 1] - segments[:, 0]
-    to = np.array([x, y]) - begin
-    share = np.clip((to * along).sum(1) / np.maximum((along**2).sum(1), 1e-12), 0.0, 1.0)
-    return float(np.linalg.norm(to - share[:, None] * along, axis=1).min())
+    return MultiLineString(lines)
 
 
 @pytest.fixture(scope="module")
@@ -95,14 +88,14 @@ class TestAnExport:
         road = built_road(name)
         tree = etree.parse(write_openscenario(made, 0, tmp_path / "case", road))
         road_file = tree.find(".//RoadNetwork/LogicFile").get("filepath")
-        segments = lane_centres(tmp_path / "case" / road_file)
+        centres = lane_centres(tmp_path / "case" / road_file)
         compared = 0
         for who, column in (("pov", 0), ("vut", 1)):
             vertices = tree.findall(f".//Trajectory[@name='{who} recorded']//Vertex")
             motion = made.trajectory(0).motion[:, column, 0].tolist()
             for vertex, x_m in zip(vertices, motion, strict=True):
                 place = vertex.find("Position/WorldPosition")
-                off_m = distance(segments, float(place.get("x")), float(place.get("y")))
+                off_m = centres.distance(Point(float(place.get("x")), float(place.get("y"))))
                 path = road.ramp if who == "vut" else road.mainline
                 if not path.piece(x_m).is_internal:
                     assert off_m < 0.03, x_m
@@ -116,12 +109,12 @@ class TestAnExport:
         road = foreign_lane_road(name, tmp_path)
         begin_m, end_m = road.lane_m
         (tmp_path / "road.xodr").write_bytes(opendrive(road))
-        segments = lane_centres(tmp_path / "road.xodr")
+        centres = lane_centres(tmp_path / "road.xodr")
         for on_ramp in (False, True):
             for x_m in np.arange(max(begin_m, -200.0), end_m + 100.0, 1.7):
                 at = road.lane_point(float(x_m), on_ramp=on_ramp)
                 if not at.lane.startswith(":"):
-                    assert distance(segments, at.x_m, at.y_m) < 0.03, x_m
+                    assert centres.distance(Point(at.x_m, at.y_m)) < 0.03, x_m
         entries = etree.parse(tmp_path / "road.xodr").findall(".//lane[@type='entry']")
         assert len(entries) == len(road.acceleration_lane.lanes)
 

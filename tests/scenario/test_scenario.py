@@ -15,7 +15,7 @@ from merge_sumo.campaigns.scenario_suggestion import suggested, unseen
 from merge_sumo.errors import UserError
 from merge_sumo.metrics.measures import Measures
 from merge_sumo.road.loader import road_for
-from merge_sumo.road.scenario_file import named_scenario, read_scenario, to_toml
+from merge_sumo.road.scenario_file import named_scenario, to_toml
 from merge_sumo.scenario.case import Case, Pool, to_unit
 from merge_sumo.scenario.scenario import RANGES, US23, Scenario
 from merge_sumo.scenario.trajectory import End, Trajectory
@@ -34,7 +34,7 @@ class TestAFile:
     def test_gives_back_what_was_written(self, tmp_path):
         written = replace(US23, name="mine", x_pov0_m=(-220.0, -90.5), v_vut0_mps=12.25)
         (tmp_path / "any.toml").write_text(to_toml(written, ["two", "lines"]))
-        assert read_scenario(tmp_path / "any.toml") == written
+        assert named_scenario(str(tmp_path / "any.toml")) == written
 
     def test_says_only_what_differs_and_finds_its_net_next_to_it(self, tmp_path):
         (tmp_path / "short.toml").write_text('net = "a/b.net.xml"\nx_vut0_m = -90\n')
@@ -59,7 +59,7 @@ class TestAFile:
         path = tmp_path / "wrong.toml"
         path.write_text(f"# a comment\nlevel0_v_mps = 25.0\n{line}\n")
         with pytest.raises(UserError) as refused:
-            read_scenario(path)
+            named_scenario(str(path))
         assert said in str(refused.value)
         assert str(refused.value).startswith(f"{path}, line 3: ")
 
@@ -69,7 +69,7 @@ class TestAFile:
         value = f"[{number}, {number}]" if field.type.startswith("Bounds") else number
         (tmp_path / "far.toml").write_text(f"{field.name} = {value}\n")
         with pytest.raises(UserError, match=rf"{field.name} is .*: (choose|it must be finite)"):
-            read_scenario(tmp_path / "far.toml")
+            named_scenario(str(tmp_path / "far.toml"))
 
     @pytest.mark.parametrize(
         ("content", "said"),

@@ -6,17 +6,9 @@ import subprocess
 import sys
 from pathlib import Path
 
-import pytest
-
 from merge_sumo.road.loader import default_net_path, road_of
-from merge_sumo.road.road import Road
 
 ROOT = Path(__file__).resolve().parents[2]
-
-
-@pytest.fixture(scope="module")
-def road() -> Road:
-    return road_of()
 
 
 def test_the_shipped_nets_are_what_their_sources_build(tmp_path):
@@ -27,8 +19,8 @@ def test_the_shipped_nets_are_what_their_sources_build(tmp_path):
     assert default_net_path().name in built
 
 
-class TestTheShippedRoad:
-    def test_has_the_merge_point_as_origin_of_all_lanes(self, road):
-        for path in (road.mainline, road.ramp):
-            before, behind = path.pieces
-            assert before.shape[-1][:2] == behind.shape[0][:2] == (0.0, 0.0)
+def test_the_merge_point_is_the_origin_of_all_lanes():
+    road = road_of()
+    for path in (road.mainline, road.ramp):
+        before, after = path.pieces
+        assert before.shape[-1][:2] == after.shape[0][:2] == (0.0, 0.0)
