@@ -177,7 +177,7 @@ class Rollout:
             end_m = simulation.road.mainline.after_m - END_OF_ROAD_M
             ended = self.follows_up & (simulation.x_m.max(axis=0) >= end_m)
         else:
-            ended = arrived
+            ended = arrived.copy()
         ended |= self.row >= self.timeout_at
         for corridor in self.errors:
             ended[corridor] = True
