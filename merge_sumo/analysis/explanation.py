@@ -1,4 +1,4 @@
-"""Why a case fails: the smallest change of one coordinate or parameter with which it passes."""
+"""Explanations: the smallest change of one coordinate or parameter with which a failure passes."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import partial
 from itertools import groupby
 from operator import itemgetter
 from typing import Annotated, Any
@@ -23,38 +22,36 @@ from merge_sumo.metrics.outcome import Episode, Outcome
 from merge_sumo.records import Record, replaced, to_plain
 from merge_sumo.result import Result
 from merge_sumo.scenario.case import Case, coordinates
-from merge_sumo.scenario.scenario import level_name
+from merge_sumo.scenario.scenario import Coordinate, level_name
 from merge_sumo.simulation.evaluate import evaluate
 from merge_sumo.simulation.plan import Engine, SimulationPlan
 from merge_sumo.workers import open_workers
 
 START_STEPS = 160
-"""Values of the grid over a coordinate: 1 m and .06 m/s in the pool of the paper."""
+"""Steps of the grid over a coordinate: 1 m and .06 m/s in the pool of the paper."""
 PARAMETER_STEPS = 40
-"""Values of the grid over the range of a parameter; each of them is another VUT."""
+"""Steps of the grid over the range of a parameter; each value is another VUT."""
 BLOCK = 16
-"""Values of a side of the grid that run at a time, so that workers have something to do."""
+"""Values of the grid that run at a time, on one side of the failure's value."""
 PSI = 0.0
 """Orientation of a POV that becomes one of level 2."""
 
 Trial = tuple[ControllerSpec, Case]
-"""The spec of a VUT, and a case that it drives."""
+"""A VUT by its spec, and a case that it drives."""
 
 
 class Axis(Record, frozen=True):
     """Values of a coordinate or a parameter, and the nearest ones with which a failure passes.
 
-    Values are whole numbers of units of their last digit.
-
     Attributes:
-        name: a coordinate, as a field of the case, or a parameter of the VUT.
-        value: its value in the failure.
-        low: the least value of the range.
-        high: the largest value.
+        name: field of the coordinate in the case, or name of the parameter of the VUT.
+        value: its value in the failure, in the unit of the coordinate or the parameter.
+        low: lower end of the range that was searched.
+        high: upper end.
         step: step of the grid.
         digits: digits after the point of the values that were tried.
-        below: the nearest value under the failure's that passes; None where none was found.
-        above: the nearest value over it.
+        below: the nearest passing value below that of the failure; None where none was found.
+        above: the nearest passing value above it, likewise.
     """
 
     name: Annotated[str, Meta(min_length=1, max_length=100)]
@@ -82,6 +79,9 @@ class Axis(Record, frozen=True):
 
         It begins with the failure's value, rounded away from that side. It is empty where the
         range ends there.
+
+        Args:
+            sign: 1 for the values above that of the failure, -1 for those below.
         """
         # A whole number of units may be off by a rounding error.
         own = math.floor(sign * self.value * self.scale + 1e-6)
@@ -98,10 +98,10 @@ class Explanation(Record, frozen=True):
 
     Attributes:
         index: of the case in its campaign.
-        start: its coordinates, with psi at level 2, in the pool's order.
-        levels: whether the case passes at other levels of the POV, by their name.
+        start: its coordinates in the order of the pool, with psi at level 2.
+        levels: whether the case passes at the other levels of the POV, by their name.
         parameters: parameters of the VUT.
-        vut: the VUT that drove; None for that of the campaign.
+        vut: spec of the VUT that drove; None for that of the campaign.
     """
 
     index: Annotated[int, Meta(ge=0)]
@@ -112,12 +112,12 @@ class Explanation(Record, frozen=True):
 
     @property
     def key(self) -> tuple[int, str]:
-        """The case and the VUT: a file has one explanation of them."""
+        """The case and the VUT: a file has one explanation for each such pair."""
         return self.index, self.vut or ""
 
     @property
     def nearest_start(self) -> tuple[str, float] | None:
-        """The coordinate and the value of the smallest change of the start that passes."""
+        """Coordinate and value of the smallest change, as a share of the pool; None without any."""
         nearest, least = None, math.inf
         for axis in self.start:
             for value in axis.passing:
@@ -149,7 +149,11 @@ class ExplanationResult(Result):
 
 
 def failure_of(run: RecordedCampaign, index: int | None) -> Outcome:
-    """Return a failure of a campaign by its index, by default the worst.
+    """Return a failure of a campaign.
+
+    Args:
+        run: the campaign.
+        index: index of the failure; None for the worst.
 
     Raises:
         UserError: for an index without a case, and a case that did not fail.
@@ -165,7 +169,7 @@ def failure_of(run: RecordedCampaign, index: int | None) -> Outcome:
 
 
 def write_worst_explanation(study: RunStudy) -> None:
-    """Explain the worst failure of a campaign that has just ended, where that takes no SUMO.
+    """Explain the worst failure of a campaign that has just ended.
 
     Nothing is written for drivers that need SUMO, nor where the engines differ.
 
@@ -188,8 +192,8 @@ def explain(
 
     Args:
         study: the campaign, and how its cases run.
-        index: index of the failure; by default the worst.
-        ranges: parameters of the VUT that are searched, too.
+        index: index of the failure; None for the worst.
+        ranges: parameters of the VUT, with the range to search.
 
     Raises:
         UserError: for an index without a failure, for a campaign with another net or other POVs,
@@ -219,8 +223,8 @@ class _Search:
         """Take the failure, and how its cases run."""
         self._study, self._index, self._case = study, outcome.index, outcome.case
         self._vut = study.plan.vut.spec
-        self._stated: dict[Trial, bool] = {}
-        """The trials of the explanation, and whether they pass."""
+        self._reported: dict[Trial, bool] = {(self._vut, self._case): False}
+        """Whether the trials pass that the explanation reports; confirmed in SUMO at the end."""
 
     def explanation(self, ranges: Sequence[Range]) -> Explanation:
         """Search along all axes, and confirm the result in SUMO.
@@ -230,28 +234,27 @@ class _Search:
         """
         case, plan = self._case, self._study.plan
         present = values_of(plan.vut, ranges)
-        self._stated[self._vut, case] = False
         self._confirm(plan)
         levels = {}
         for level in plan.povs.levels:
             if level != case.level:
                 psi = PSI if level == 2 else None
-                other = self._vut, replace(case, level=level, svo_rad=psi)
-                levels[level_name(level)] = self._stated[other] = self._passes(plan, [other])[0]
+                trial = self._vut, replace(case, level=level, svo_rad=psi)
+                (passes,) = self._passes(plan, [trial])
+                levels[level_name(level)] = self._reported[trial] = passes
         start = []
         for c in coordinates(case.scenario, (case.level,)):
-            value, bounds = getattr(case, c.field), (c.low, c.high)
-            axis = _axis(c.field, value, *bounds, c.digits, START_STEPS)
+            axis = _axis(c.field, getattr(case, c.field), c, START_STEPS)
             start.append(self._searched(axis, self._with_start))
         parameters = []
-        for r in ranges:
-            axis = _axis(r.name, present[r.name], r.low, r.high, r.digits, PARAMETER_STEPS)
+        for one in ranges:
+            axis = _axis(one.name, present[one.name], one, PARAMETER_STEPS)
             parameters.append(self._searched(axis, self._with_parameter))
         self._confirm(replace(plan, engine=Engine.SUMO))
         return Explanation(self._index, tuple(start), levels, tuple(parameters))
 
     def _confirm(self, plan: SimulationPlan) -> None:
-        if self._passes(plan, self._stated) != list(self._stated.values()):
+        if self._passes(plan, self._reported) != list(self._reported.values()):
             raise UserError(
                 f"case {self._index} ends otherwise when it runs again: the VUT is not that of the "
                 "campaign, or does not repeat itself, and nothing can be said of its changes"
@@ -260,14 +263,14 @@ class _Search:
     def _searched(self, axis: Axis, trial: Callable[[str, float], Trial]) -> Axis:
         """Return an axis with the nearest values that pass."""
 
-        def ask(values: list[float]) -> list[bool]:
-            trials = map(partial(trial, axis.name), values)
+        def passes(values: list[float]) -> list[bool]:
+            trials = [trial(axis.name, value) for value in values]
             return self._passes(self._study.plan, trials)
 
-        below, above = nearest(axis, -1, ask), nearest(axis, 1, ask)
+        below, above = nearest(axis, -1, passes), nearest(axis, 1, passes)
         for value in (below, above):
             if value is not None:
-                self._stated[trial(axis.name, value)] = True
+                self._reported[trial(axis.name, value)] = True
         return replaced(axis, below=below, above=above)
 
     def _with_start(self, name: str, value: float) -> Trial:
@@ -279,13 +282,15 @@ class _Search:
 
     def _passes(self, plan: SimulationPlan, trials: Iterable[Trial]) -> list[bool]:
         """Run trials, those of a VUT at a time; a value that the controller refuses fails."""
-        passes = []
+        passes: list[bool] = []
         for spec, of_vut in groupby(trials, key=itemgetter(0)):
             cases = [case for _, case in of_vut]
             try:
                 vut = plan.vut if spec == self._vut else plan.vut.with_spec(spec)
-                passed = evaluate(replace(plan, vut=vut), cases, self._study.workers, pass_of)
-                passes += list(passed)
+                changed = replace(plan, vut=vut)
+                passes += list(
+                    evaluate(changed, cases, self._study.workers, passes_without_contact)
+                )
             except UserError:
                 if spec == self._vut:
                     raise
@@ -293,14 +298,15 @@ class _Search:
         return passes
 
 
-def _axis(name: str, value: float, low: float, high: float, digits: int, steps: int) -> Axis:
-    """Return an axis whose grid has a number of steps over its range, or fewer."""
+def _axis(name: str, value: float, range_: Coordinate | Range, steps: int) -> Axis:
+    """Return an axis over a range whose grid has a number of steps, or fewer."""
+    low, high, digits = range_.low, range_.high, range_.digits
     unit = 10.0**-digits
     step = max(1, round((high - low) / steps / unit)) * unit
     return Axis(name, float(value), low, high, round(step, digits), digits)
 
 
-def nearest(axis: Axis, sign: int, ask: Callable[[list[float]], list[bool]]) -> float | None:
+def nearest(axis: Axis, sign: int, passes: Callable[[list[float]], list[bool]]) -> float | None:
     """Return the first value of one side of an axis that passes; None where none does.
 
     The values of the grid run until one passes; then the interval before it is halved. Verdicts are
@@ -309,29 +315,31 @@ def nearest(axis: Axis, sign: int, ask: Callable[[list[float]], list[bool]]) -> 
     Args:
         axis: the axis.
         sign: 1 for the values above that of the failure, -1 for those below.
-        ask: returns whether values pass.
+        passes: returns whether the case passes with each of some values.
     """
     grid = axis.grid(sign)
     for begin in range(0, len(grid) - 1, BLOCK):
         block = grid[begin : begin + BLOCK + 1]
-        passed = ask([units / axis.scale for units in block[1:]])
+        passed = passes([units / axis.scale for units in block[1:]])
         if True in passed:
-            first = passed.index(True)
-            fails, passes = block[first : first + 2]
+            fails, succeeds = block[passed.index(True) :][:2]
             break
     else:
         return None
-    while abs(passes - fails) > 1:
-        middle = (fails + passes) // 2
-        if ask([middle / axis.scale]) == [True]:
-            passes = middle
+    while abs(succeeds - fails) > 1:
+        middle = (fails + succeeds) // 2
+        if passes([middle / axis.scale]) == [True]:
+            succeeds = middle
         else:
             fails = middle
-    return passes / axis.scale
+    return succeeds / axis.scale
 
 
-def pass_of(episode: Episode) -> bool:
-    """Return whether a case has a verdict, does not fail, and ends without a contact."""
+def passes_without_contact(episode: Episode) -> bool:
+    """Return whether a case passes and no bodies touch.
+
+    Args:
+        episode: the episode of the case.
+    """
     outcome = episode.outcome
-    touches = outcome.measures.severity == Severity.CONTACT
-    return outcome.is_tested and not outcome.failed and not touches
+    return outcome.passes and outcome.measures.severity != Severity.CONTACT

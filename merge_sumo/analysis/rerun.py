@@ -1,8 +1,8 @@
-"""The recorded cases of a campaign again, with a changed VUT, as a comparison of both."""
+"""Recorded cases of a campaign run again with a changed VUT, and are compared with the record."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 from merge_sumo.analysis.cases_file import CasesFile
@@ -25,10 +25,10 @@ from merge_sumo.files import free
 from merge_sumo.metrics.outcome import Episode, Outcome
 from merge_sumo.printable import counted
 from merge_sumo.scenario.scenario import AnyLevels, level_name, names_of_levels
-from merge_sumo.simulation.evaluate import evaluate, open_simulators, with_measures
+from merge_sumo.simulation.evaluate import open_simulators, with_measures
 
 AGAIN = (Change.BROKE, Change.WORSE, Change.STILL_CONTACT, Change.FIXED)
-"""Changes whose cases run a second time, where a controller drives that may not repeat itself."""
+"""Changes of which the case runs once more, where its controller may not repeat itself."""
 
 
 def chosen(
@@ -39,7 +39,10 @@ def chosen(
     Args:
         run: the campaign.
         indices: indices of cases; none for all.
-        level: levels of the cases.
+        level: levels of the cases, as a user names them.
+
+    Returns:
+        The outcomes, in the order of the indices.
 
     Raises:
         UserError: for an index or a level without a case, and where no case is left.
@@ -75,7 +78,7 @@ def rerun(study: RunStudy, recorded: Sequence[Outcome]) -> Comparison:
     study.check_same_system(may_change=True)
     study = replace(study, plan=study.plan.for_cases(len(recorded)))
     open_simulators(study.plan, study.workers)
-    episodes = _episodes(study, recorded, study.on_cases)
+    episodes = _episodes(study, recorded)
     outcomes, motions = [], {}
     for outcome in recorded:
         outcomes.append(episodes[outcome.index].outcome)
@@ -97,7 +100,8 @@ def rerun(study: RunStudy, recorded: Sequence[Outcome]) -> Comparison:
         cases.append(one)
         if one.change in AGAIN and one.later_runs is None:
             changed.append(one.later)
-    second_episodes = _episodes(study, may_not_repeat(changed, settings))
+    uncounted = RunStudy(run, settings, study.plan, study.workers)
+    second_episodes = _episodes(uncounted, may_not_repeat(changed, settings))
     repeats = []
     for row, one in enumerate(cases):
         second = second_episodes.get(one.later.index)
@@ -125,16 +129,14 @@ def rerun(study: RunStudy, recorded: Sequence[Outcome]) -> Comparison:
     return replace(compared, version_changes=changes, notes=tuple(notes), page_command=page)
 
 
-def _episodes(
-    study: RunStudy, outcomes: Sequence[Outcome], on_cases: Callable[[int], None] = lambda _: None
-) -> dict[int, Episode]:
+def _episodes(study: RunStudy, outcomes: Sequence[Outcome]) -> dict[int, Episode]:
     """Run the cases of outcomes again; return their episodes by index."""
     # In another order than that of the campaign, which a VUT with a memory would repeat.
     backwards = outcomes[::-1]
-    again = [outcome.case for outcome in backwards]
-    ran = evaluate(study.plan, again, study.workers, with_measures)
+    cases = [outcome.case for outcome in backwards]
     episodes = {}
-    for old, episode in zip(backwards, ran, strict=True):
-        episodes[old.index] = episode.at(old.index, old.batch)
-        on_cases(1)
+    for outcome, episode in zip(
+        backwards, study.simulate(study.plan, cases, with_measures), strict=True
+    ):
+        episodes[outcome.index] = episode.at(outcome.index, outcome.batch)
     return episodes

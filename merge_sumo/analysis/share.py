@@ -1,6 +1,6 @@
 """The share of all starts that fail, by uniform cases.
 
-A search looks for failures, so the share of its cases that fail says nothing of the pool.
+A search looks for failures, so the share of its own cases that fail is not that of the pool.
 """
 
 # By the equations of motion thousands of uniform cases take less than a second. A controller of a
@@ -38,9 +38,14 @@ Count = Annotated[int, Meta(ge=0)]
 
 
 class LevelShare(Record, frozen=True):
-    """Uniform cases of a POV level: how many fail, and how many have no verdict.
+    """Uniform cases of a POV level, and how many of them fail.
 
-    A case has no verdict after an error, and where the VUT never reached the merge point.
+    Attributes:
+        level: level of the POV.
+        cases: number of cases.
+        failures: number of those that fail.
+        without_verdict: number of those without a verdict: after an error, and where the VUT never
+            reached the merge point.
     """
 
     level: Count
@@ -50,9 +55,9 @@ class LevelShare(Record, frozen=True):
 
     @property
     def interval(self) -> tuple[float, float]:
-        """The exact interval of the share; without failures one-sided, from 0.
+        """The exact interval of the share, from 0 to 1; one-sided without failures.
 
-        Cases without a verdict are safe for its lower end, and failures for the upper.
+        Cases without a verdict count as safe for its lower end, and as failures for its upper end.
         """
         confidence = CONFIDENCE if self.failures else 2.0 * CONFIDENCE - 1.0
         most = self.failures + self.without_verdict
@@ -74,7 +79,11 @@ def _percent(share: float) -> str:
 
 
 class Shares(Record, frozen=True):
-    """The share that fails at each level."""
+    """The share of starts that fail.
+
+    Attributes:
+        levels: the shares, one for each level.
+    """
 
     levels: tuple[LevelShare, ...]
 
@@ -83,9 +92,13 @@ SHARES = StudyFile("shares.json", Shares)
 
 
 def own_shares(run: RecordedCampaign) -> list[LevelShare]:
-    """Return the share of the cases of a campaign that fail; undecided ones have no verdict.
+    """Return the share of the cases of a campaign that fail, for each level.
 
-    It is that of all starts where the campaign drew its cases uniformly.
+    It is that of all starts where the campaign drew its cases uniformly. An undecided case has no
+    verdict.
+
+    Args:
+        run: the campaign.
     """
     unsure = undecided(run.outcomes, run.tolerated)
     shares = []
@@ -100,14 +113,14 @@ def own_shares(run: RecordedCampaign) -> list[LevelShare]:
 def write_shares(
     study: RunStudy, on_part: Callable[[int, int], None] = lambda _done, _total: None
 ) -> None:
-    """Measure the share that fails at each level of a campaign that has just ended.
+    """Measure the share that fails at each level of a campaign that has just ended, and write it.
 
     The cases of a campaign that drew them uniformly are counted where further ones take long or
     decide nothing: for drivers that ask SUMO, where a case may fail in some of its runs, and where
     most cases end as errors. Of other such campaigns nothing is written.
 
     Args:
-        study: the campaign, and how it ran.
+        study: the campaign, and how its cases run.
         on_part: called with the number of cases that are done, and of all; may raise.
     """
     run, plan = study.run, study.plan
@@ -126,7 +139,6 @@ def write_shares(
     # Worker processes would take longer to start than the cases by the equations of motion.
     with workers_or_serial(None if by_equations else study.workers) as workers:
         for level in run.levels:
-            on_part(len(shares) * count, len(run.levels) * count)
             cases = uniform_cases(plan.scenario, level, count, run.settings.seed)
             try:
                 ended = list(evaluate(plan, cases, workers, end_of))
@@ -139,7 +151,7 @@ def write_shares(
 
 
 def uniform_cases(scenario: Scenario, level: int, count: int, seed: int) -> list[Case]:
-    """Return the uniform cases of a level of a campaign.
+    """Return uniform cases of a level, which no sampler draws.
 
     Args:
         scenario: scenario of the cases.

@@ -1,4 +1,4 @@
-"""Sensitivity of verdicts to small changes of the simulation.
+"""Stress tests: the sensitivity of verdicts to small changes of the simulation.
 
 The cases of a campaign run again on each rung of a ladder: with one change of the plan or of the
 cases. A failure is robust where it fails on every rung.
@@ -14,10 +14,10 @@ from typing import Annotated, Any
 import numpy as np
 from msgspec import Meta
 
-from merge_sumo.analysis.run_study import RunStudy, StudyFile
+from merge_sumo.analysis.run_study import RunStudy, StudyFile, end_of
 from merge_sumo.campaigns.recorded import failures
 from merge_sumo.errors import UserError
-from merge_sumo.metrics.outcome import Episode, Outcome
+from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.records import Record
 from merge_sumo.result import Result
 from merge_sumo.scenario.case import Case
@@ -43,14 +43,14 @@ class Flips(Record, frozen=True):
 
 
 class Rung(Record, frozen=True):
-    """The results of the cases on one rung.
+    """The results of the cases on one rung of the ladder.
 
     Attributes:
         name: short name, as "lag-0.2".
         about: the change, in a phrase.
         source: source of its number; empty for none.
-        runs: the verdicts that flip, by run: several where the change is drawn at random.
-        skipped: why it was not run, in a clause; empty where it was.
+        runs: the verdicts that flip, run by run: several where the change is drawn at random.
+        skipped: reason why it was not run, in a clause; empty where it was.
     """
 
     name: str
@@ -61,7 +61,7 @@ class Rung(Record, frozen=True):
 
     @property
     def counts(self) -> tuple[int, int, int]:
-        """Failures that pass, passes that fail, and cases without a verdict, over all runs."""
+        """Numbers of failures that pass, passes that fail, and cases without a verdict."""
         passes = fails = without_verdict = 0
         for run in self.runs:
             passes += len(run.passes)
@@ -71,7 +71,7 @@ class Rung(Record, frozen=True):
 
     @property
     def flips(self) -> int:
-        """Verdicts that flip, over all runs."""
+        """Number of verdicts that flip, over all runs."""
         return sum(self.counts)
 
 
@@ -83,8 +83,8 @@ class StressResult(Result, Record, frozen=True):
         print(found.robust)
 
     Attributes:
-        cases: recorded cases with a verdict: those that ran again.
-        failures: indices of those that had failed, the worst first.
+        cases: number of recorded cases with a verdict, which ran again.
+        failures: indices of those that failed in the record, the worst first.
         rungs: the results on each rung.
         vut: name of the VUT.
     """
@@ -107,20 +107,28 @@ class StressResult(Result, Record, frozen=True):
         return tuple(index for index in self.failures if not self.passes_in(index))
 
     def passes_in(self, index: int) -> int:
-        """Return in how many runs of all rungs a failure does not fail."""
+        """Return the number of runs, over all rungs, in which a failure does not fail.
+
+        Args:
+            index: index of the failure.
+        """
         count = 0
         for rung in self.rungs:
             count += sum(index in (*run.passes, *run.without_verdict) for run in rung.runs)
         return count
 
     def share(self, rung: Rung) -> float:
-        """Return the share of verdicts that flip on a rung."""
+        """Return the share of verdicts that flip on a rung.
+
+        Args:
+            rung: the rung.
+        """
         return rung.flips / max(self.cases * len(rung.runs), 1)
 
 
 STRESS = StudyFile("stress.json", StressResult)
 PART_S = 0.02
-"""Step of the rung with a shorter step than that of eq. (4)."""
+"""Step of the simulation on the rung `step`, in s; that of eq. (4) is longer."""
 LAGS_S = (0.2, 0.35, 0.5)
 POWER_W_PER_KG = 34.0
 """Power over mass: above this a car is of class 3, the highest. UN GTR No. 15, Annex 1."""
@@ -129,10 +137,10 @@ ERROR_V_MPS = 2.0 / 3.6
 """Accuracy of a radar for lane changes: 50 cm and 2 km/h. Autoliv NB24G1V2, user's manual, 3.1."""
 ERRORS_BY_UNIT = {"m": ERROR_X_M, "m/s": ERROR_V_MPS}
 OF_VUT = {"v_vut0_mps", *(coordinate.field for coordinate in IMPERFECTIONS)}
-"""Coordinates that do not belong to another car."""
+"""Coordinates of the VUT, which no rung changes."""
 CAR_LENGTH_M = 5.0
 DRAWS = 5
-"""Times that all cases run where a change is drawn at random, with the seed of the case."""
+"""Number of runs of all cases where a change is drawn at random, with the seed of the case."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,10 +151,10 @@ class Disturbance:
         name: short name.
         about: the change, in a phrase.
         source: source of its number.
-        plan: returns the plan of the rung by that of the campaign; raises `UserError` where the
+        plan: returns the plan of the rung from that of the campaign; raises `UserError` where the
             rung cannot run.
-        case: returns a case of the rung by one of the campaign and a random generator; None for the
-            same coordinates.
+        case: returns the case of the rung from one of the campaign and a random generator; None
+            for the same coordinates.
     """
 
     name: str
@@ -157,7 +165,7 @@ class Disturbance:
 
     @property
     def draws(self) -> int:
-        """Number of times that all cases run."""
+        """Number of runs of all cases."""
         return 1 if self.case is None else DRAWS
 
 
@@ -234,6 +242,9 @@ RUNS = sum(one.draws for one in RUNGS)
 def stress(study: RunStudy) -> StressResult:
     """Run the cases of a campaign on every rung, and write the results into its folder.
 
+    Args:
+        study: the campaign, and how its cases run.
+
     Raises:
         UserError: for a campaign without a verdict, or with another net or other POVs.
     """
@@ -249,14 +260,10 @@ def stress(study: RunStudy) -> StressResult:
     return found
 
 
-def outcome_of(episode: Episode) -> Outcome:
-    """Return the outcome of a case."""
-    return episode.outcome
-
-
 def _rung(study: RunStudy, tested: Sequence[Outcome], one: Disturbance) -> Rung:
     """Run all cases with a change; a rung that cannot run is skipped with its reason."""
     flips: list[Flips] = []
+    skipped = ""
     try:
         plan = one.plan(study.plan.for_cases(len(tested)))
         for draw in range(one.draws):
@@ -266,23 +273,28 @@ def _rung(study: RunStudy, tested: Sequence[Outcome], one: Disturbance) -> Rung:
                 if one.case is not None:
                     case = one.case(case, np.random.default_rng([draw, case.seed]))
                 cases.append(case)
-            flips.append(flips_of(tested, study.simulate(plan, cases, outcome_of)))
+            flips.append(flips_of(tested, study.simulate(plan, cases, end_of)))
     except UserError as error:
         if one.name == UNCHANGED:
             raise
         study.on_cases((one.draws - len(flips)) * len(tested))
-        return Rung(one.name, one.about, one.source, skipped=str(error))
-    return Rung(one.name, one.about, one.source, tuple(flips))
+        flips, skipped = [], str(error)
+    return Rung(one.name, one.about, one.source, tuple(flips), skipped)
 
 
-def flips_of(tested: Sequence[Outcome], again: Sequence[Outcome]) -> Flips:
-    """Return the verdicts that flip in another run of the same cases."""
+def flips_of(tested: Sequence[Outcome], again: Sequence[tuple[bool, bool, bool]]) -> Flips:
+    """Return the verdicts that flip in another run of the same cases.
+
+    Args:
+        tested: the recorded outcomes, each with a verdict.
+        again: `end_of` the cases in the other run.
+    """
     passes, fails, without_verdict = [], [], []
-    for before, now in zip(tested, again, strict=True):
-        if not now.is_tested:
-            without_verdict.append(before.index)
-        elif before.failed and not now.failed:
-            passes.append(before.index)
-        elif now.failed and not before.failed:
-            fails.append(before.index)
+    for outcome, (failed, is_tested, _) in zip(tested, again, strict=True):
+        if not is_tested:
+            without_verdict.append(outcome.index)
+        elif outcome.failed and not failed:
+            passes.append(outcome.index)
+        elif failed and not outcome.failed:
+            fails.append(outcome.index)
     return Flips(tuple(passes), tuple(fails), tuple(without_verdict))

@@ -1,4 +1,4 @@
-"""The probability to fail of cases that a campaign did not run, by a surrogate.
+"""The failure probability of cases that a campaign did not run, by a surrogate.
 
 It is the surrogate of the sampler `coverage`, learned from the outcomes of any sampler.
 """
@@ -29,12 +29,24 @@ Grid = tuple[int, int, int]
 
 @dataclass(frozen=True, slots=True)
 class Surface:
-    """The surrogate of one level of a run; `predict` returns the probability to fail."""
+    """The surrogate of one level of a campaign.
+
+    Example:
+        surface = learn_surface(run.outcomes, level=0)
+        chance = surface.chance(nodes((50, 50, 1)))
+
+    Attributes:
+        predict: returns the failure probability, (n,), at points, (n, d), of the unit cube.
+    """
 
     predict: Callable[[FloatArray], FloatArray]
 
     def chance(self, points: FloatArray) -> FloatArray:
-        """Return the chance that cases at points, (n, d), of the unit cube fail: (n,)."""
+        """Return the failure probability of cases, (n,), computed on all cores.
+
+        Args:
+            points: points of the unit cube, (n, d).
+        """
         parts = np.array_split(points, len(points) // PART + 1)
         # Each part in one thread: the answer is the same whatever the number of cores.
         with threadpool_limits(1), ThreadPoolExecutor(number_of_workers(None)) as cores:
@@ -42,7 +54,11 @@ class Surface:
 
 
 def nodes(grid: Grid) -> FloatArray:
-    """Return the nodes of a grid of the unit cube, (n, d), the first coordinate running fastest."""
+    """Return the nodes of a grid of the unit cube, (n, d), the first coordinate running fastest.
+
+    Args:
+        grid: number of nodes along each coordinate.
+    """
     axes = [np.linspace(0.0, 1.0, n) for n in grid if n > 1]
     mesh = np.meshgrid(*axes[::-1], indexing="ij")
     return np.stack([axis.ravel() for axis in mesh[::-1]], axis=1)
@@ -51,12 +67,15 @@ def nodes(grid: Grid) -> FloatArray:
 def learn_surface(
     outcomes: Sequence[Outcome], level: int, tolerated: float = 0.0
 ) -> Surface | None:
-    """Return the surrogate of a level, or None where too few cases failed to learn from.
+    """Learn the surrogate of a level.
 
     Args:
         outcomes: outcomes of a campaign.
         level: level of the POV.
-        tolerated: share of its runs in which a case may fail.
+        tolerated: share of its runs in which a case may fail, 0 to 1.
+
+    Returns:
+        The surrogate; None where too few cases failed or passed to learn from.
     """
     at_level = [outcome for outcome in outcomes if outcome.case.level == level]
     if not at_level:

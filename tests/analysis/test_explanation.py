@@ -86,7 +86,9 @@ class TestACampaign:
         assert not (own.folder / EXPLANATIONS.name).exists()
 
     def test_is_not_explained_where_the_engines_differ(self, tmp_path, monkeypatch):
-        monkeypatch.setattr("merge_sumo.analysis.explanation.pass_of", lambda _: True)
+        monkeypatch.setattr(
+            "merge_sumo.analysis.explanation.passes_without_contact", lambda _: True
+        )
         run = ms.campaign(
             "level0", level=0, sampler="uniform", cases=60, seed=1, out=tmp_path / "run"
         )

@@ -13,13 +13,10 @@ from msgspec import structs
 
 import merge_sumo as ms
 from merge_sumo.analysis.stress import DRAWS, RUNGS, STRESS, Flips, Rung, flips_of
-from merge_sumo.metrics.measures import Measures
-from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.records import to_plain
 from merge_sumo.road.loader import road_for
 from merge_sumo.scenario.imperfection import Actuation
 from merge_sumo.scenario.scenario import US23
-from merge_sumo.scenario.trajectory import End
 from merge_sumo.simulation.kinematic_simulation import KinematicSimulation
 
 FAIL_WHEN = "bumper_gap_m < 15"
@@ -96,10 +93,10 @@ def test_the_report_lists_robust_failures_first_where_there_is_a_stress_test(run
 def test_flips_by_hand(run):
     failed = next(o for o in run.recorded.outcomes if o.failed)
     passed = next(o for o in run.recorded.outcomes if o.is_tested and not o.failed)
-    timeout = Outcome(0, 0, failed.case, Measures(end=End.TIMEOUT, score=-400.0))
     both = [failed, passed]
-    assert flips_of(both, both) == Flips()
-    assert flips_of(both, both[::-1]) == Flips((failed.index,), (passed.index,))
+    fails, passes, timeout = (True, True, True), (False, True, True), (False, False, True)
+    assert flips_of(both, [fails, passes]) == Flips()
+    assert flips_of(both, [passes, fails]) == Flips((failed.index,), (passed.index,))
     assert flips_of(both, [timeout] * 2) == Flips((), (), (failed.index, passed.index))
 
 
