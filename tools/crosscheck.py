@@ -198,7 +198,7 @@ def uniform(settings: CampaignSettings, count: int, seed: int) -> list[Case]:
 
 def failed(plan: SimulationPlan, trajectory: Trajectory) -> bool:
     """Return whether a case fails by the criterion of the campaign."""
-    return plan.criterion.bare_outcome(trajectory, centre_lines(plan.road)).failed
+    return plan.criterion.outcome(trajectory, centre_lines(plan.road)).failed
 
 
 def largest_deviations(plan: SimulationPlan, known: Sequence[Trajectory]) -> tuple[float, float]:

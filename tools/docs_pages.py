@@ -59,6 +59,8 @@ def measures_page() -> str:
     rows = ""
     for name, measure in MEASURES.items():
         about = f"{measure.about}.".replace("|", r"\|")
+        if measure.only_with:
+            about += f" Recorded with {measure.only_with} only."
         worse = f"{measure.worse}er values" if measure.worse else ""
         rows += f"| `{name}` | {measure.unit} | {about} | {worse} |\n"
     head = "| name | unit | definition | worse |\n|---|---|---|---|\n"

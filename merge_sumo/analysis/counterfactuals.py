@@ -216,7 +216,7 @@ def _avoided(
     for case, trajectory in zip(cases, trajectories, strict=True):
         whole = case.from_the_start(trajectory)
         can_brake = brake_after_mps2(whole) <= -case.scenario.a_min_mps2
-        avoided.append(can_brake and plan.criterion.bare_outcome(whole, lines).passes)
+        avoided.append(can_brake and plan.criterion.outcome(whole, lines).passes)
     return avoided
 
 

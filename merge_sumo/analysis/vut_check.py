@@ -122,7 +122,7 @@ def _checked(simulator: Simulator, plan: SimulationPlan) -> tuple[list[str], lis
                 "It draws random numbers, reads a clock, or keeps something from earlier episodes: "
                 "in its object (which attributes does `reset` not clear?), its class or its module."
             )
-    outcomes = [plan.criterion.outcome(k, 0, one) for k, one in enumerate(first)]
+    outcomes = [plan.criterion.outcome(one, index=k) for k, one in enumerate(first)]
     in_vain = Counter(command for one in first for command in one.in_vain)
     notes = doubts(outcomes, plan.criterion, in_vain)
     if headline := mostly_clipped(outcomes):

@@ -1,13 +1,13 @@
-"""The failure criterion: a named criterion, or a condition on the measures of a case.
+"""The failure criterion: a named criterion, a condition on measures, or a requirement over time.
 
-Every case has a margin, below 0 for a failure, in units of the thresholds (`expression.py`), or of
-lambda under the criterion of the paper.
+It gives each case a margin, below 0 for a failure, in units of the thresholds (`expression.py`), or
+of lambda under the criterion of the paper.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Set
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -35,10 +35,15 @@ PAPER = "paper"
 
 @dataclass(frozen=True, slots=True)
 class NamedCriterion:
-    """A criterion that has a name."""
+    """A criterion with a name.
 
-    condition: str  # over measures, under which a case fails
-    about: str  # what fails, in a phrase
+    Attributes:
+        condition: condition over measures under which a case fails.
+        about: meaning of the condition, in a phrase.
+    """
+
+    condition: str
+    about: str
 
 
 CRITERIA = {
@@ -63,10 +68,6 @@ TEXTS = {
     "nearest": frozenset(VEHICLES) - {VEHICLES[VUT]},
 }
 """Values of measures that are texts. Errors have no verdict under any criterion."""
-NO_TEXT = frozenset({"merged_first", "severity"})
-"""Measures that are texts, and that an episode may lack."""
-CLOSE: dict[str, Value] = {"drac_mps2": math.inf, "last_avoidable_s": -math.inf}
-"""Values where |dx| < 6 m: no braking is enough, and there was no way out at any time."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,15 +76,15 @@ class Criterion:
 
     Attributes:
         fail_when: the name of a criterion, or a condition over measures, as Python writes it.
-        require: a formula of signal temporal logic instead (`temporal.py`), which has to hold; its
-            robustness is the margin.
+        require: a formula of signal temporal logic that has to hold, in place of a condition; its
+            robustness is the margin (`temporal.py`).
 
     Raises:
         UserError: the text is not a criterion.
 
     Example:
         >>> criterion = Criterion("ttc_s < 1.5")
-        >>> criterion.outcome(0, 0, trajectory).failed
+        >>> criterion.outcome(trajectory).failed
     """
 
     fail_when: str = PAPER
@@ -103,7 +104,15 @@ class Criterion:
             object.__setattr__(self, "require", check_formula(self.require))
 
     def check(self, scenario: Scenario) -> None:
-        """Raise `UserError` where a scenario lacks a measure, or no formula can be evaluated."""
+        """Check that the criterion can be evaluated in a scenario.
+
+        Args:
+            scenario: the scenario.
+
+        Raises:
+            UserError: the scenario lacks a measure of the condition, or rtamt cannot evaluate the
+                formula.
+        """
         if self.require is not None:
             try_formula(self.require)
             return
@@ -122,7 +131,7 @@ class Criterion:
 
     @property
     def is_papers(self) -> bool:
-        """Whether it is that of the paper, whose margin is that of the score."""
+        """Whether it is the criterion of the paper, whose margin is that of the score."""
         return self.fail_when == PAPER and self.require is None
 
     @property
@@ -131,7 +140,11 @@ class Criterion:
         return self.require is None and "score" in condition_of(self.condition).names
 
     def description(self, scenario: Scenario) -> str:
-        """Return when a case of a scenario fails, in the words that a user reads."""
+        """Return when a case of a scenario fails, as a clause for a user.
+
+        Args:
+            scenario: the scenario.
+        """
         if self.is_papers:
             limit = f"{scenario.dx_crash_m:g} m"
             return f"front bumpers are within {limit} when the VUT reaches {scenario.goal}"
@@ -144,12 +157,17 @@ class Criterion:
 
     @property
     def condition(self) -> str:
-        """Return when a case fails, as a condition."""
+        """The condition under which a case fails."""
         named = CRITERIA.get(self.as_written)
         return self.as_written if named is None else named.condition
 
     def margin(self, trajectory: Trajectory, measures: Measures) -> float | None:
-        """Return the margin of an episode; None after an error."""
+        """Return the margin of an episode; None after an error.
+
+        Args:
+            trajectory: the motion.
+            measures: its measures.
+        """
         if measures.end.is_error:
             return None
         if self.is_papers:
@@ -160,35 +178,23 @@ class Criterion:
         return condition.margin(values_of(measures, condition.names))
 
     def outcome(
-        self, index: int, batch: int, trajectory: Trajectory, lines: CentreLines | None = None
+        self, trajectory: Trajectory, lines: CentreLines | None = None, index: int = 0
     ) -> Outcome:
-        """Return the outcome of an episode at a place in a campaign.
+        """Return the outcome of an episode outside of campaigns; measures follow when read.
 
         Args:
+            trajectory: the motion.
+            lines: centre lines of the road; None for no clearance before M.
             index: index of the case.
-            batch: number of its batch.
-            trajectory: the motion.
-            lines: centre lines of the road.
-        """
-        measures = Measures.of(trajectory, lines)
-        margin = self.margin(trajectory, measures)
-        return Outcome(index, batch, trajectory.case, measures, margin=margin)
-
-    def bare_outcome(self, trajectory: Trajectory, lines: CentreLines | None = None) -> Outcome:
-        """Return the outcome of an episode outside of campaigns, with the measures it needs.
-
-        Args:
-            trajectory: the motion.
-            lines: centre lines of the road.
         """
         measures = Measures(trajectory, lines)
         margin = self.margin(trajectory, measures)
-        return Outcome(0, 0, trajectory.case, measures, margin=margin)
+        return Outcome(index, 0, trajectory.case, measures, margin=margin)
 
     def is_close_call(
         self, trajectory: Trajectory, rounding: float, lines: CentreLines | None = None
     ) -> bool:
-        """Return whether another motion, by a rounding error in m, could have another verdict.
+        """Return whether a rounding error in the motion could change the verdict.
 
         Args:
             trajectory: the motion.
@@ -198,7 +204,7 @@ class Criterion:
         if self.is_papers:
             last, crash_m = trajectory.motion[-1, :, 0], trajectory.case.scenario.dx_crash_m
             return bool(abs(abs(last[trajectory.nearest] - last[VUT]) - crash_m) <= rounding)
-        margin = self.bare_outcome(trajectory, lines).margin
+        margin = self.outcome(trajectory, lines).margin
         return margin is not None and abs(margin) <= rounding
 
 
@@ -213,30 +219,46 @@ def _parsed(text: str) -> tuple[Condition, str]:
 
 
 def condition_of(text: str) -> Condition:
-    """Return the condition that a criterion states, by its words."""
+    """Return the parsed condition of a criterion.
+
+    Args:
+        text: the condition as Python writes it.
+    """
     return _parsed(text)[0]
 
 
 def vocabulary() -> Vocabulary:
-    """Return the values that may be in a condition: None for a number, or the possible texts."""
-    known: dict[str, Set[str] | None] = {}
-    for name, one in known_measures().items():
-        if one.missing is not None:
-            known[name] = None
-    return known | TEXTS
+    """Return the measures of conditions by name: None for a number, or the possible texts."""
+    numbers = [name for name, one in known_measures().items() if one.missing is not None]
+    return {**dict.fromkeys(numbers), **TEXTS}
 
 
 def values_of(measures: Measures, names: Iterable[str] | None = None) -> dict[str, Value]:
-    """Return the values for a condition by name; by default all of the vocabulary."""
-    missing: dict[str, Value] = dict(CLOSE) if measures.is_close else {}
-    if measures.end is End.MERGED:
-        missing["brake_after_mps2"] = math.inf
-    if measures.after_gap_m is not None and measures.after_gap_m <= 0.0:
-        missing["after_drac_mps2"] = math.inf
+    """Return the values of measures in a condition.
+
+    Args:
+        measures: measures of an episode.
+        names: names of the measures; None for the whole vocabulary.
+
+    Returns:
+        By name; a measure without a value has `Measure.missing`, or "" if it is a text. Where a
+        conflict or contact leaves no braking and no way out that is enough, it has its worst value.
+    """
+    after_gap_m = measures.after_gap_m
+    is_too_late = {
+        "drac_mps2": measures.is_close,
+        "last_avoidable_s": measures.is_close,
+        "brake_after_mps2": measures.end is End.MERGED,
+        "after_drac_mps2": after_gap_m is not None and after_gap_m <= 0.0,
+    }
     values: dict[str, Value] = {}
     for name in vocabulary() if names is None else names:
-        value = measures.value(name)
-        if value is None:
-            value = missing.get(name, "" if name in NO_TEXT else known_measures()[name].missing)
-        values[name] = value if isinstance(value, str) else float(value or 0.0)
+        value, measure = measures.value(name), known_measures()[name]
+        if value is None and name in TEXTS:
+            value = ""
+        elif value is None and is_too_late.get(name):
+            value = math.inf if measure.worse == "high" else -math.inf
+        elif value is None:
+            value = measure.missing
+        values[name] = value if isinstance(value, str) else float(value)
     return values

@@ -5,7 +5,7 @@ its docstring is the definition. Records, `--fail-when`, reports, exports and do
 
     from merge_sumo.metrics.measures import Measures, measure
 
-    @measure(unit="m", missing=math.inf)
+    @measure(missing=math.inf)
     def closest_m(episode: Measures) -> float:
         \"\"\"Least distance of the front bumpers.\"\"\"
         return float(np.abs(episode.trajectory.x_pov_m - episode.trajectory.x_vut_m).min())
@@ -45,6 +45,8 @@ from merge_sumo.scenario.trajectory import End, Trajectory, as_reason
 
 T = TypeVar("T")
 
+UNITS = {"m": "m", "s": "s", "mps": "m/s", "mps2": "m/s2"}
+"""Units by the last part of the name of a measure."""
 SUSTAINED_STEPS = 16
 """Steps over which braking counts as sustained: 1.6 s, as in published braking of drivers."""
 FOLLOW_UP = "a follow-up"
@@ -57,18 +59,18 @@ class Measure(Generic[T]):
     """A measure of an episode: its function, its unit, and how it is shown.
 
     Attributes:
-        of: returns the value of an episode, None where it has none; infinite is none, too.
+        function: returns the value of an episode; None or infinite where it has none.
         unit: empty for a number without one, and for a text.
         label: name in the listing of an episode; empty where that leaves it out.
         column: name in the table of the report; empty where that leaves it out.
         digits: decimals in tables.
         missing: value in conditions where an episode has none; None for a text.
-        worse: at which end of its values an episode is worse, if at one.
+        worse: end of the values at which an episode is worse; None where neither end is.
         only_with: part of a scenario that the measure needs; empty for every scenario.
         default: value where nothing is recorded.
     """
 
-    of: Callable[[Any], T]
+    function: Callable[[Any], T]
     unit: str = ""
     label: str = ""
     column: str = ""
@@ -81,12 +83,12 @@ class Measure(Generic[T]):
     @property
     def name(self) -> str:
         """The name in records and conditions."""
-        return self.of.__name__
+        return self.function.__name__
 
     @property
     def about(self) -> str:
         """The definition, in a sentence without its full stop."""
-        return " ".join((inspect.getdoc(self.of) or "").split()).removesuffix(".")
+        return " ".join((inspect.getdoc(self.function) or "").split()).removesuffix(".")
 
     def __get__(self, measures: object, owner: object = None) -> T:
         """Return the value in the measures of an episode."""
@@ -98,16 +100,19 @@ class Measure(Generic[T]):
     def compute(self, episode: Measures) -> Any:
         """Return the value in an episode; None for an infinite one.
 
+        Args:
+            episode: the measures of an episode with its motion.
+
         Raises:
             UserError: the function of another package fails.
         """
         if self.name in OURS:
-            value: Any = self.of(episode)
+            value: Any = self.function(episode)
         elif episode.end.is_error:
             return None
         else:
             try:
-                value = self.of(episode)
+                value = self.function(episode)
                 value = None if value is None else float(value)
             except Exception as error:
                 last = extract_tb(error.__traceback__)[-1]
@@ -121,17 +126,19 @@ class Measure(Generic[T]):
 def measure(
     worse: Literal["low", "high"] | None = None, **shown: Any
 ) -> Callable[[Callable[[Any], T]], Measure[T]]:
-    """Declare a measure by its function.
+    """Declare a measure by its function, whose name ends with the unit.
 
     Args:
-        worse: at which end of its values an episode is worse. An episode without a value counts as
-            one at the other end: cars that never meet.
+        worse: end of the values at which an episode is worse. An episode without a value counts as
+            one at the other end, such as cars that never meet.
         shown: other attributes of `Measure`.
     """
     missing = {"low": math.inf, "high": 0.0, None: None}[worse]
 
     def declared(function: Callable[[Any], T]) -> Measure[T]:
-        return Measure(of=function, worse=worse, **{"missing": missing, **shown})
+        unit = UNITS.get(function.__name__.rpartition("_")[2], "")
+        known = {"unit": unit, "missing": missing, "worse": worse}
+        return Measure(function=function, **{**known, **shown})
 
     return declared
 
@@ -171,7 +178,12 @@ class Measures:
 
     @classmethod
     def of(cls, trajectory: Trajectory, lines: CentreLines | None = None) -> Measures:
-        """Return all measures of an episode."""
+        """Return all measures of an episode.
+
+        Args:
+            trajectory: the motion.
+            lines: centre lines of the road; None for no clearance before M.
+        """
         (measures,) = measures_of([trajectory], lines)
         measures.compute_all()
         return measures
@@ -182,7 +194,11 @@ class Measures:
             self.value(name)
 
     def value(self, name: str) -> Any:
-        """Return the value of a measure, of this package or another; None where it has none."""
+        """Return the value of a measure; None where the episode has none.
+
+        Args:
+            name: name of the measure, of this package or another.
+        """
         if name not in self.values:
             known = known_measures()[name]
             computed = known.default if self.trajectory is None else known.compute(self)
@@ -225,12 +241,12 @@ class Measures:
         """P, never positive; None without a verdict (VUT_ERROR, SIM_ERROR)."""
         return merge_score(self.trajectory)
 
-    @measure(unit="m", label="front bumpers, x_POV - x_VUT", column="Δx at M", missing=math.inf)
+    @measure(label="front bumpers, x_POV - x_VUT", column="Δx at M", missing=math.inf)
     def dx_m(self) -> float | None:
         """x_POV - x_VUT, of the front bumpers."""
         return self._at_end(0)
 
-    @measure(unit="m/s", label="v_POV - v_VUT", column="dv", missing=0.0)
+    @measure(label="v_POV - v_VUT", column="dv", missing=0.0)
     def dv_mps(self) -> float | None:
         """v_POV - v_VUT."""
         return self._at_end(1)
@@ -242,13 +258,13 @@ class Measures:
         last = self.trajectory.motion[-1]
         return float(last[self.trajectory.nearest, column] - last[VUT, column])
 
-    @measure(worse="low", unit="s", label="time to collision", column="TTC")
+    @measure(worse="low", label="time to collision", column="TTC")
     def ttc_s(self) -> float | None:
         """Time to collision -dx/dv where dx dv < 0, else None (infinite)."""
         dx, dv = self.dx_m, self.dv_mps
         return None if dx is None or dv is None else time_to_collision(dx, dv)
 
-    @measure(worse="low", unit="s", label="post-encroachment time", column="PET")
+    @measure(worse="low", label="post-encroachment time", column="PET")
     def pet_s(self) -> float | None:
         """Post-encroachment time: time between the two front bumpers at M (Allen et al., 1978).
 
@@ -256,7 +272,7 @@ class Measures:
         """
         return _post_encroachment_time(self.trajectory) if self.end.is_tested else None
 
-    @measure(unit="s", column="time", missing=0.0)
+    @measure(column="time", missing=0.0)
     def t_end_s(self) -> float:
         """Time at which the episode ended."""
         return self.trajectory.t_end_s
@@ -275,7 +291,7 @@ class Measures:
             return Severity.CONFLICT
         return Severity.HARSH if (self.after_brake_mps2 or 0.0) > HARSH_MPS2 else Severity.SAFE
 
-    @measure(worse="low", unit="m", label="bumper gap at M", column="bumper gap at M")
+    @measure(worse="low", label="bumper gap at M", column="bumper gap at M")
     def bumper_gap_m(self) -> float | None:
         """Smallest gap between bumpers at M.
 
@@ -284,7 +300,7 @@ class Measures:
         """
         return min((car.gap_m for car in neighbours(self.trajectory)), default=None)
 
-    @measure(worse="low", unit="m", label="smallest gap from M on", column="clearance")
+    @measure(worse="low", label="smallest gap from M on", column="clearance")
     def clearance_m(self) -> float | None:
         """Smallest gap between bumpers from M on, to the end of the follow-up.
 
@@ -292,9 +308,7 @@ class Measures:
         """
         return closest_after_m(self.trajectory)[0]
 
-    @measure(
-        worse="low", unit="m", label="smallest clearance before M", column="clearance before M"
-    )
+    @measure(worse="low", label="smallest clearance before M", column="clearance before M")
     def before_clearance_m(self) -> float | None:
         """Smallest distance of bodies before M, where the lanes run together.
 
@@ -304,7 +318,7 @@ class Measures:
             return None
         return closest_before_m([self.trajectory], self.lines)[0]
 
-    @measure(worse="high", unit="m/s2", label="deceleration to keep 6 m apart")
+    @measure(worse="high", label="deceleration to keep 6 m apart")
     def drac_mps2(self) -> float | None:
         """Deceleration rate to avoid a crash that the follower needs at t1.
 
@@ -321,7 +335,6 @@ class Measures:
 
     @measure(
         worse="high",
-        unit="m/s2",
         label="braking that M asks of the rear",
         column="braking asked after M",
     )
@@ -335,7 +348,6 @@ class Measures:
 
     @measure(
         worse="high",
-        unit="m/s2",
         label="hardest braking of the VUT",
         column="VUT brakes",
         default=0.0,
@@ -346,7 +358,6 @@ class Measures:
 
     @measure(
         worse="high",
-        unit="m/s2",
         label="hardest braking of the POV",
         column="POV brakes",
         default=0.0,
@@ -357,24 +368,26 @@ class Measures:
 
     @measure(
         worse="high",
-        unit="m/s2",
         label="braking of the POV over 1.6 s",
         column="POV brakes over 1.6 s",
     )
     def pov_sustained_brake_mps2(self) -> float | None:
-        """Largest mean deceleration of the POV over 1.6 s, or over an episode that is shorter.
+        """Largest mean deceleration of the POV over 1.6 s, or over a shorter episode.
 
-        None in records of versions without it, as the next.
+        None in records of versions without it.
         """
         return sustained_brake_mps2(self.trajectory.motion[:, self.trajectory.nearest, 1])
 
-    @measure(worse="high", unit="m/s", label="slow-down of the POV", column="POV slows by")
+    @measure(worse="high", label="slow-down of the POV", column="POV slows by")
     def pov_slowdown_mps(self) -> float | None:
-        """Largest loss of speed of the POV up to t1, from the highest speed that it had before."""
+        """Largest loss of speed of the POV up to t1, from the highest speed before.
+
+        None in records of versions without it.
+        """
         v_mps = self.trajectory.motion[:, self.trajectory.nearest, 1]
         return float((np.maximum.accumulate(v_mps) - v_mps).max())
 
-    @measure(worse="high", unit="m/s", label="impact speed", column="impact")
+    @measure(worse="high", label="impact speed", column="impact")
     def impact_speed_mps(self) -> float | None:
         """Relative speed at the first contact; None without one."""
         return closest_after_m(self.trajectory)[1]
@@ -386,19 +399,18 @@ class Measures:
             return None
         return "VUT" if self.dx_m < 0 else "POV"
 
-    @measure(worse="low", unit="s", label="avoidable until")
+    @measure(worse="low", label="avoidable until")
     def last_avoidable_s(self) -> float | None:
-        """Where |dx| < 6 m at M, the last time from which the VUT could have kept 6 m.
+        """Last time from which the VUT could have kept 6 m, where |dx| < 6 m at M.
 
         At full acceleration or full braking by eq. (4), against the recorded motion of the other
-        cars, which then keep their last speed; None when there was no such time, and where
-        |dx| >= 6 m.
+        cars, which then keep their last speed; None without such a time, and where |dx| >= 6 m.
         """
         return last_avoidable_s(self.trajectory) if self.is_close else None
 
     @measure()
     def avoidable(self) -> bool | None:
-        """Where |dx| < 6 m at M, whether there was such a time; else None."""
+        """Whether the VUT could have kept 6 m from some time on; None where |dx| >= 6 m at M."""
         return self.last_avoidable_s is not None if self.is_close else None
 
     @measure(worse="high", digits=0, default=0)
@@ -408,67 +420,65 @@ class Measures:
 
     @measure()
     def error(self) -> str | None:
-        """Message of an error of the VUT or of the simulation, also after M, else None."""
+        """Message of an error of the VUT or of the simulation, also after M; None without one."""
         return None if self.trajectory.error is None else as_reason(self.trajectory.error)
 
     @measure(only_with=TRAFFIC, default=VEHICLES[POV])
     def nearest(self) -> Vehicle:
-        """Name of the car that the measures are of; recorded in traffic only."""
+        """Name of the car that the measures are of."""
         return VEHICLES[self.trajectory.nearest]
 
-    @measure(worse="low", unit="m", label="smallest bumper gap after M", only_with=FOLLOW_UP)
+    @measure(worse="low", label="smallest bumper gap after M", only_with=FOLLOW_UP)
     def after_gap_m(self) -> float | None:
         """Least gap between bumpers in the follow-up, 0 or less where bodies touch.
 
-        This and the next three are None without a merge, and recorded where there is a follow-up
-        only.
+        None without a merge.
         """
-        after = self._after()
-        return None if after is None else float(after[0].min())
+        return float(self._after()[0].min(initial=math.inf))
 
-    @measure(worse="low", unit="s", label="time to collision after M", only_with=FOLLOW_UP)
+    @measure(worse="low", label="time to collision after M", only_with=FOLLOW_UP)
     def after_ttc_s(self) -> float | None:
-        """Lowest time to collision in it, between bumpers, 0 where bodies touch.
+        """Lowest time to collision between bumpers in the follow-up, 0 where bodies touch.
 
-        None where no gap closes.
+        None where no gap closes, and without a merge.
         """
-        after = self._after()
-        if after is None:
-            return None
-        gap_m, closing_mps = after
-        if gap_m.min() <= 0.0:
+        gap_m, closing_mps = self._after()
+        if (gap_m <= 0.0).any():
             return 0.0
         closes = closing_mps > 0.0
         return float((gap_m[closes] / closing_mps[closes]).min(initial=math.inf))
 
-    @measure(worse="high", unit="m/s2", label="braking needed after M", only_with=FOLLOW_UP)
+    @measure(worse="high", label="braking needed after M", only_with=FOLLOW_UP)
     def after_drac_mps2(self) -> float | None:
-        """Hardest braking that it needs, dv^2 / (2 gap); None where bodies touch."""
-        after = self._after()
-        if after is None or after[0].min() <= 0.0:
+        """Hardest braking that the follow-up needs, dv^2 / (2 gap).
+
+        None where bodies touch, and without a merge.
+        """
+        if self.after_gap_m is None or self.after_gap_m <= 0.0:
             return None
-        gap_m, closing_mps = after
+        gap_m, closing_mps = self._after()
         closes = closing_mps > 0.0
         return float((np.square(closing_mps[closes]) / (2.0 * gap_m[closes])).max(initial=0.0))
 
-    @measure(worse="high", unit="m/s2", label="hardest braking after M", only_with=FOLLOW_UP)
+    @measure(worse="high", label="hardest braking after M", only_with=FOLLOW_UP)
     def after_brake_mps2(self) -> float | None:
-        """Hardest braking in it of cars behind the VUT, and of the VUT behind the nearest car."""
+        """Hardest braking in the follow-up.
+
+        It is of cars behind the VUT, and of the VUT where the nearest car is ahead; None without a
+        merge.
+        """
         return braked_after_mps2(self.trajectory)
 
-    def _after(self) -> tuple[FloatArray, FloatArray] | None:
+    def _after(self) -> tuple[FloatArray, FloatArray]:
         """Return bumper gaps and closing speeds in the follow-up, (T, A - 1) each."""
-        after = self.trajectory.after
-        return None if after is None else gaps_m(after, self.trajectory.case.scenario.lengths_m)
+        motion = (
+            self.trajectory.motion[:0] if self.trajectory.after is None else self.trajectory.after
+        )
+        return gaps_m(motion, self.trajectory.case.scenario.lengths_m)
 
-    @measure(
-        unit="m", label="place of the merge", column="merges at", missing=math.inf, only_with=LANE
-    )
+    @measure(label="place of the merge", column="merges at", missing=math.inf, only_with=LANE)
     def x_merge_m(self) -> float | None:
-        """On an acceleration lane, where the VUT merges.
-
-        This and the next six are recorded there only, and None without a merge.
-        """
+        """Place on an acceleration lane where the VUT merges; None without a merge."""
         merges = self.trajectory.case.scenario.lane_m and self.end is End.MERGED
         return place_of_merge_m(self.trajectory) if merges else None
 
@@ -480,44 +490,45 @@ class Measures:
         only_with=LANE,
     )
     def lane_share(self) -> float | None:
-        """Place of the merge as a share of the acceleration lane, from its begin."""
+        """Place of the merge as a share of the acceleration lane, from its begin.
+
+        None without a merge.
+        """
         lane_m, x_m = self.trajectory.case.scenario.lane_m, self.x_merge_m
         if lane_m is None or x_m is None:
             return None
         return (x_m - lane_m[0]) / (lane_m[1] - lane_m[0])
 
-    @measure(worse="low", unit="m", label="gap ahead at the merge", only_with=LANE)
+    @measure(worse="low", label="gap ahead at the merge", only_with=LANE)
     def gap_ahead_m(self) -> float | None:
-        """Bumper gap at the merge to the car ahead; None without one, as the next three."""
+        """Bumper gap at the merge to the car ahead; None without such a car or a merge."""
         return self._lane_gap(is_ahead=True)[0]
 
-    @measure(worse="low", unit="m", label="gap behind at the merge", only_with=LANE)
+    @measure(worse="low", label="gap behind at the merge", only_with=LANE)
     def gap_behind_m(self) -> float | None:
-        """Bumper gap at the merge to the car behind."""
+        """Bumper gap at the merge to the car behind; None without such a car or a merge."""
         return self._lane_gap(is_ahead=False)[0]
 
     @measure(
         worse="low",
-        unit="s",
         label="time gap ahead at the merge",
         column="time gap ahead",
         digits=2,
         only_with=LANE,
     )
     def time_gap_ahead_s(self) -> float | None:
-        """Gap ahead over the speed of the VUT."""
+        """Gap ahead over the speed of the VUT; None without a gap, and where the VUT stands."""
         return self._lane_gap(is_ahead=True)[1]
 
     @measure(
         worse="low",
-        unit="s",
         label="time gap behind at the merge",
         column="time gap behind",
         digits=2,
         only_with=LANE,
     )
     def time_gap_behind_s(self) -> float | None:
-        """Gap behind over the speed of the car behind."""
+        """Gap behind over the speed of the car behind; None without a gap, and where it stands."""
         return self._lane_gap(is_ahead=False)[1]
 
     def _lane_gap(self, *, is_ahead: bool) -> tuple[float | None, float | None]:
@@ -531,7 +542,6 @@ class Measures:
 
     @measure(
         worse="high",
-        unit="s",
         label="stood on the lane",
         column="stood",
         only_with=LANE,
@@ -578,7 +588,11 @@ def known_measures() -> dict[str, Measure[Any]]:
 
 
 def measures_in(scenario: Scenario) -> dict[str, Measure[Any]]:
-    """Return the measures that are recorded in a scenario, by name."""
+    """Return the measures that are recorded in a scenario, by name.
+
+    Args:
+        scenario: the scenario.
+    """
     parts = {""}
     if scenario.follow_up_s > 0.0:
         parts.add(FOLLOW_UP)
@@ -590,7 +604,9 @@ def measures_in(scenario: Scenario) -> dict[str, Measure[Any]]:
 
 
 def measures_of(trajectories: Sequence[Trajectory], lines: CentreLines | None) -> list[Measures]:
-    """Return the measures of episodes of one scenario; those of bodies are computed together.
+    """Return the measures of episodes of one scenario.
+
+    Clearances before M are computed for all episodes at once, which is faster.
 
     Args:
         trajectories: the motions.
@@ -607,7 +623,11 @@ def measures_of(trajectories: Sequence[Trajectory], lines: CentreLines | None) -
 
 
 def sustained_brake_mps2(v_mps: FloatArray) -> float:
-    """Return the largest mean deceleration over 1.6 s of speeds, (T + 1,), or over all of them."""
+    """Return the largest mean deceleration over 1.6 s, or over a shorter time of speeds, in m/s2.
+
+    Args:
+        v_mps: speeds of a vehicle, (T + 1,), in m/s.
+    """
     steps = min(SUSTAINED_STEPS, len(v_mps) - 1)
     if steps < 1:
         return 0.0

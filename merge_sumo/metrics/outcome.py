@@ -182,7 +182,7 @@ def record_of(scenario: Scenario) -> Any:
     optional: list[tuple[str, Any, Any]] = []
     for name, one in measures_in(scenario).items():
         if name in OURS and one.only_with != FOLLOW_UP:
-            required.append((name, get_type_hints(one.of)["return"]))
+            required.append((name, get_type_hints(one.function)["return"]))
         else:
             optional.append((name, float | None, None))
     optional += [

@@ -30,46 +30,57 @@ TTC_SHARE = 1.0 / 9.0
 
 
 def margin_of(score: float | None) -> float | None:
-    """Return the margin of a score P: how far it is above lambda, in units of that."""
+    """Return the margin of a score P: how far it is above lambda, in units of lambda.
+
+    Args:
+        score: the score; None after an error.
+    """
     return None if score is None else (score - FAILURE_SCORE) / abs(FAILURE_SCORE)
 
 
 def is_close(trajectory: Trajectory) -> bool:
-    """Return whether the VUT arrived at M with |dx| < 6 m: the paper's rule of a crash."""
+    """Return whether the VUT arrived at M with |dx| < 6 m: the paper's rule of a crash.
+
+    Args:
+        trajectory: the motion.
+    """
     x_m, crash_m = trajectory.motion[-1, :, 0], trajectory.case.scenario.dx_crash_m
     near = bool(abs(x_m[trajectory.nearest] - x_m[VUT]) < crash_m)
     return trajectory.end is End.MERGED and near
 
 
-def merge_score(trajectory: Trajectory) -> float | None:
-    """Return the score P of a merge; None after an error."""
-    if trajectory.end.is_error:
-        return None
-    dx = ttc = None
-    if trajectory.end.is_tested:
-        pov, vut = trajectory.motion[-1, [trajectory.nearest, VUT], :2].tolist()
-        dx = pov[0] - vut[0]
-        ttc = time_to_collision(dx, pov[1] - vut[1])
-    return _score(trajectory, dx, ttc, close=is_close(trajectory))
-
-
 def time_to_collision(dx_m: float, dv_mps: float) -> float | None:
-    """Return TTC = -dx/dv in seconds where the gap closes (dx dv < 0), else None (section VI-C)."""
+    """Return TTC = -dx/dv in seconds where the gap closes (dx dv < 0), else None (section VI-C).
+
+    Args:
+        dx_m: x_POV - x_VUT, in m.
+        dv_mps: v_POV - v_VUT, in m/s.
+    """
     return -dx_m / dv_mps if dx_m * dv_mps < 0 else None
 
 
-def _score(trajectory: Trajectory, dx: float | None, ttc: float | None, *, close: bool) -> float:
-    p_safety = 0.0
-    if dx is not None:
-        scenario = trajectory.case.scenario
-        overlap = scenario.dx_crash_m - abs(dx)
-        if close:
-            p_safety = -1.0 - overlap / scenario.dx_crash_m
+def merge_score(trajectory: Trajectory) -> float | None:
+    """Return the score P of a merge; None after an error.
+
+    Args:
+        trajectory: the motion.
+    """
+    if trajectory.end.is_error:
+        return None
+    scenario = trajectory.case.scenario
+    crash = p_safety = 0.0
+    if trajectory.end.is_tested:
+        pov, vut = trajectory.motion[-1, [trajectory.nearest, VUT], :2].tolist()
+        dx_m = pov[0] - vut[0]
+        ttc_s = time_to_collision(dx_m, pov[1] - vut[1])
+        overlap_m = scenario.dx_crash_m - abs(dx_m)
+        if is_close(trajectory):
+            crash = MU_CRASH
+            p_safety = -1.0 - overlap_m / scenario.dx_crash_m
         else:
-            short_ttc = 0.0 if ttc is None else max(0.0, 1.0 - ttc / scenario.ttc_min_s)
-            near = math.exp(overlap / GAP_SCALE_M)
+            short_ttc = 0.0 if ttc_s is None else max(0.0, 1.0 - ttc_s / scenario.ttc_min_s)
+            near = math.exp(overlap_m / GAP_SCALE_M)
             p_safety = -(1.0 - TTC_SHARE) * near - TTC_SHARE * short_ttc
-    crash = MU_CRASH if close else 0.0
     return crash + MU_SAFETY * p_safety + MU_TASK * _task(trajectory)
 
 

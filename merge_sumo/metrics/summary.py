@@ -7,11 +7,9 @@ its runs fail.
 from __future__ import annotations
 
 import re
-from collections import Counter
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from enum import StrEnum
 from functools import cache
 from typing import Any
 
@@ -232,7 +230,6 @@ class LevelSummary:
         cases: cases that ran.
         tested: cases in which the VUT reached the merge point.
         failures: failing cases, without the undecided ones.
-        severities: number of cases by severity, for those that occur.
         fmc: failure mode coverage of the failing cases, decided or not, in the unit cube of the
             level; M(s, 0.05, -500) under the paper's criterion in up to three coordinates.
         regions: groups of these cases that are linked at the radius of FMC.
@@ -242,7 +239,6 @@ class LevelSummary:
     cases: int
     tested: int
     failures: int
-    severities: dict[str, int]
     fmc: float
     regions: int
     undecided: int = 0
@@ -281,8 +277,6 @@ class Summary:
         undecided_cases: deciding runs, by index, of failing cases with too few runs to decide.
         error_groups: errors and timeouts by message: errors first, then the most frequent.
         goal: place that the VUT reaches in a case that is tested.
-        ends: number of cases by end, for those that occur.
-        severities: number of cases by severity, for those that occur.
         levels: summaries of POV levels.
 
     Example:
@@ -299,8 +293,6 @@ class Summary:
     undecided_cases: frozenset[int]
     error_groups: tuple[ErrorGroup, ...]
     goal: str
-    ends: dict[str, int]
-    severities: dict[str, int]
     levels: dict[int, LevelSummary]
 
     @property
@@ -383,16 +375,8 @@ def summarise(
         undecided_cases=frozenset(unsure),
         error_groups=_error_groups(untested),
         goal=cases[0].case.scenario.goal if cases else US23.goal,
-        ends=_tally(End, (case.measures.end for case in cases)),
-        severities=_tally(Severity, (case.measures.severity for case in cases)),
         levels={level: _of_level(cases, level, unsure) for level in levels},
     )
-
-
-def _tally(kinds: Iterable[StrEnum], values: Iterable[StrEnum | None]) -> dict[str, int]:
-    """Return the number of values of each kind that occurs, in the order of the kinds."""
-    counts = Counter(values)
-    return {kind.value: counts[kind] for kind in kinds if counts[kind]}
 
 
 def _of_level(cases: Iterable[Outcome], level: int, unsure: set[int]) -> LevelSummary:
@@ -404,7 +388,6 @@ def _of_level(cases: Iterable[Outcome], level: int, unsure: set[int]) -> LevelSu
         cases=len(at_level),
         tested=sum(case.is_tested for case in at_level),
         failures=len(failed) - undecided_cases,
-        severities=_tally(Severity, (case.measures.severity for case in at_level)),
         fmc=fmc(points),
         regions=int(regions(points).max(initial=-1)) + 1,
         undecided=undecided_cases,

@@ -24,7 +24,7 @@ from merge_sumo.campaigns.recorded import (
     failures,
 )
 from merge_sumo.drivers.reference import REFERENCES
-from merge_sumo.metrics.cause import heading
+from merge_sumo.metrics.cause import diagnose, kind_and_severity
 from merge_sumo.metrics.fmc import radius_for
 from merge_sumo.metrics.merge import Severity
 from merge_sumo.metrics.outcome import Outcome
@@ -226,7 +226,9 @@ def _motion(run: RecordedCampaign, undecided: frozenset[int], failing: str) -> F
         return
     worst = failed[0]
     yield Fact(WORST, worst.index, "lowest margin")
-    kind = heading(worst, run.trajectories([worst.index]).get(worst.index))
+    motion = run.trajectories([worst.index]).get(worst.index)
+    diagnosis = None if motion is None else diagnose(motion, worst.measures)
+    kind = kind_and_severity(worst, diagnosis)
     yield Fact(KIND, kind, "severity, impact_speed_mps; by its motion")
     decided = [outcome for outcome in failed if outcome.index not in undecided]
     if avoidable := _values(decided, "avoidable"):

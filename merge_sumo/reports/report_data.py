@@ -102,8 +102,8 @@ def _row(model: ReportModel, outcome: Outcome) -> dict[str, Any]:
         "margin": _rounded(outcome.margin, 3),
         "region": model.regions.get(index),
         "last_avoidable_s": measures.last_avoidable_s,
-        "vut_brakes_s": course and course.vut_brakes_s,
-        "pov_brakes_s": course and course.pov_brakes_s,
+        "vut_brakes_s": course and course.vut.brakes_s,
+        "pov_brakes_s": course and course.pov.brakes_s,
         "kind": model.kinds.get(index),
     }
     for coordinate in model.coordinates:

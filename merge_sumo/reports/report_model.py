@@ -13,7 +13,8 @@ from merge_sumo.analysis.surface import Surface, learn_surface
 from merge_sumo.campaigns.printed_commands import call, campaign_command, command
 from merge_sumo.campaigns.recorded import RecordedCampaign, failures, regions_of, spread_failures
 from merge_sumo.errors import UserError
-from merge_sumo.metrics.cause import Diagnosis, FailureBox, Kind, diagnose, failure_boxes
+from merge_sumo.metrics.cause import Diagnosis, Kind, diagnose
+from merge_sumo.metrics.failure_boxes import FailureBox, failure_boxes
 from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.metrics.summary import ErrorGroup, by_case, summarise
 from merge_sumo.reports.facts import facts_of
@@ -58,7 +59,7 @@ class ReportModel:
         motion: trajectories of the shown cases by index; lost ones are missing.
         diagnoses: conduct of VUT and POV by index, where the motion is there.
         kinds: kind of each failure that has one, by its index.
-        boxes: regions of failures in words.
+        boxes: boxes of the pool where cases fail, by level.
         explain: the commands that explain a case and write the report, before and after its index.
 
     Example:

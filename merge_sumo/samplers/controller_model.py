@@ -188,7 +188,7 @@ class ModelRollout:
             if not np.isnan(gaps_m[row]):
                 end, after = End.MERGED, self._follow_up(of_row[-1])
             trajectory = Trajectory(case, of_row, end, after=after)
-            gaps[row] = self._criterion.bare_outcome(trajectory, self._lines).signed_gap
+            gaps[row] = self._criterion.outcome(trajectory, self._lines).signed_gap
         return gaps.reshape(len(drives), -1)
 
     def _follow_up(self, at_m: FloatArray) -> FloatArray | None:

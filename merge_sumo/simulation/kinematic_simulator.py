@@ -107,8 +107,7 @@ class KinematicSimulator(Simulator):
             and kinematic.motion.shape == sumo.motion.shape
             and ours.shape == theirs.shape
             and np.abs(ours - theirs)[..., :2].max() <= ROUNDING
-            and criterion.bare_outcome(kinematic, lines).failed
-            == criterion.bare_outcome(sumo, lines).failed
+            and criterion.outcome(kinematic, lines).failed == criterion.outcome(sumo, lines).failed
         ):
             return
         case = kinematic.case

@@ -34,7 +34,7 @@ LEARNING = sorted(name for name, kind in SAMPLERS.items() if kind.learns)
 def played(case) -> Episode:
     """Return what becomes of a case, without SUMO."""
     trajectory = episode(case)
-    return Episode(PAPER_CRITERION.outcome(0, 0, trajectory), trajectory)
+    return Episode(PAPER_CRITERION.outcome(trajectory), trajectory)
 
 
 class Played(Workers):

@@ -63,11 +63,11 @@ class SumoSimulation:
     def scenario(self) -> Scenario:
         return ms.open_run("run").recorded.scenario
 
-    def bare_outcome(self, case: Case) -> bool:
+    def fails_alone(self, case: Case) -> bool:
         """Return whether a case fails when it is run alone."""
         at = {name: x for name in OF_A_CASE if (x := getattr(case, name)) is not None}
         found = ms.run(VUT, level=LEVEL, scenario=self.scenario, at=at)
-        return Criterion(CRITERION).outcome(0, 0, found.trajectory).failed
+        return Criterion(CRITERION).outcome(found.trajectory).failed
 
 
 def lines_of(path: Path) -> list[dict[str, Any]]:
@@ -120,7 +120,7 @@ def truth_judges_as_run(simulation: SumoSimulation) -> None:
     dims = len(simulation.scenario.dimensions(LEVEL))
     points = np.random.default_rng([0, LEVEL]).random((10, dims))
     cases = Pool(levels=(LEVEL,), scenario=simulation.scenario).cases(points, LEVEL)
-    failing = np.array([simulation.bare_outcome(case) for case in cases])
+    failing = np.array([simulation.fails_alone(case) for case in cases])
     assert (truth["failures"], truth["fmc"]) == (failing.sum(), fmc(points[failing]))
 
 
@@ -129,7 +129,7 @@ def probability_judges_as_run(simulation: SumoSimulation) -> None:
     assert found["missed"], "else nothing is told apart"
     for given in found["missed"][:3]:
         fixed = {"v_vut0_mps": simulation.scenario.bounds("v_vut0_mps")[0]}
-        assert simulation.bare_outcome(Case(scenario=simulation.scenario, **{**fixed, **given}))
+        assert simulation.fails_alone(Case(scenario=simulation.scenario, **{**fixed, **given}))
 
 
 def resume_goes_on_alike(simulation: SumoSimulation, records: list[dict[str, Any]]) -> None:

@@ -77,7 +77,7 @@ class TestAGate:
 
     @pytest.mark.parametrize(("fmc", "verb"), [(0.05, "not met"), (0.0501, "met")])
     def test_on_coverage_is_met_beyond_its_bound_at_some_level(self, fmc, verb):
-        one, other = (LevelSummary(10, 10, 0, {}, volume, 0) for volume in (0.0, fmc))
+        one, other = (LevelSummary(10, 10, 0, volume, 0) for volume in (0.0, fmc))
         found = Gate("fmc", 0.05).check(replace(summarise([]), levels={0: one, 1: other}))
         assert found.sentence == f"gate fmc>0.05: {verb} (FMC {fmc:.4f} at level 1)"
 

@@ -162,10 +162,10 @@ class TestMeasures:
 class TestNamed:
     def test_contact_is_of_bodies_and_not_of_points(self):
         # 5 m long: at 5.5 m between the fronts, a failure of the paper, they do not touch.
-        assert PAPER_CRITERION.bare_outcome(ending(5.5)).failed
-        assert not Criterion("contact").bare_outcome(ending(5.5)).failed
+        assert PAPER_CRITERION.outcome(ending(5.5)).failed
+        assert not Criterion("contact").outcome(ending(5.5)).failed
         # 0.1 m of overlap.
-        assert Criterion("contact").bare_outcome(ending(-4.9)).margin == pytest.approx(-0.1)
+        assert Criterion("contact").outcome(ending(-4.9)).margin == pytest.approx(-0.1)
 
     def test_may_be_part_of_a_condition(self):
         either = Criterion('unsafe or end == "TIMEOUT"')
@@ -179,9 +179,9 @@ class TestNamed:
 
     def test_unsafe_is_also_who_must_brake_harder_than_3(self):
         # 20 m and 10 m/s: 4 m/s2, a third beyond 3.
-        harsh = Criterion("unsafe").outcome(0, 0, ending(-25.0, v_pov=36.0, v_vut=26.0))
+        harsh = Criterion("unsafe").outcome(ending(-25.0, v_pov=36.0, v_vut=26.0))
         assert harsh.margin == pytest.approx(-1.0 / 3.0)
-        assert not Criterion("unsafe").outcome(0, 0, ending(-25.0, v_pov=27.0)).failed
+        assert not Criterion("unsafe").outcome(ending(-25.0, v_pov=27.0)).failed
 
 
 def lines(apart_m, ends_m=-20.0):
@@ -234,18 +234,16 @@ class TestBodiesBeforeM:
 class TestOutcomes:
     @pytest.mark.parametrize("margin", [True, "1", math.nan])
     def test_with_a_margin_that_is_not_a_number_are_refused(self, margin):
-        record = Criterion("ttc_s < 4").outcome(0, 0, ending(9.0)).to_record()
+        record = Criterion("ttc_s < 4").outcome(ending(9.0)).to_record()
         with pytest.raises(UserError, match=r"margin|JSON"):
             Outcome.from_json(json.dumps(record | {"margin": margin}), scenario=US23)
 
     def test_have_a_gap_of_1_where_the_criterion_turns(self):
         # A TTC of 4.2 s, against 4: 1 + 0.05; then 2 s, against 4: 1 / (1 + 0.5).
         criterion = Criterion("ttc_s < 4")
-        assert criterion.bare_outcome(ending(-21.0, v_pov=31.0)).signed_gap == pytest.approx(-1.05)
-        assert criterion.bare_outcome(ending(20.0, v_pov=16.0)).signed_gap == pytest.approx(
-            1.0 / 1.5
-        )
-        assert PAPER_CRITERION.bare_outcome(ending(-21.0)).signed_gap == pytest.approx(-3.5)
+        assert criterion.outcome(ending(-21.0, v_pov=31.0)).signed_gap == pytest.approx(-1.05)
+        assert criterion.outcome(ending(20.0, v_pov=16.0)).signed_gap == pytest.approx(1.0 / 1.5)
+        assert PAPER_CRITERION.outcome(ending(-21.0)).signed_gap == pytest.approx(-3.5)
 
 
 def test_a_campaign_by_a_condition_on_the_score_is_that_of_the_paper_and_read_back(tmp_path):

@@ -7,7 +7,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from merge_sumo.metrics.cause import Diagnosis, Kind, diagnose, failure_boxes
+from merge_sumo.metrics.cause import Diagnosis, Kind, diagnose
+from merge_sumo.metrics.failure_boxes import failure_boxes
 from merge_sumo.metrics.measures import Measures
 from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.road.scenario_file import named_scenario
@@ -68,8 +69,8 @@ class TestWhichVehicleBrakes:
         self, a_pov, a_vut, brakes_s, accelerate
     ):
         found = diagnosed(meeting(a_pov, a_vut))
-        assert (found.pov_brakes_s, found.vut_brakes_s) == brakes_s
-        assert (found.pov_accelerates, found.vut_accelerates) == accelerate
+        assert (found.pov.brakes_s, found.vut.brakes_s) == brakes_s
+        assert (found.pov.accelerates, found.vut.accelerates) == accelerate
 
     def test_in_traffic_the_car_that_the_vut_meets(self):
         pair = meeting(BRAKES, LEVEL0)
@@ -87,18 +88,18 @@ class TestWhichVehicleBrakes:
         )
         met = Trajectory(case, motion, End.MERGED)
         assert Measures.of(met).nearest == "behind"
-        assert diagnosed(met).pov_brakes_s == 3.0
+        assert diagnosed(met).pov.brakes_s == 3.0
         assert diagnosed(met).kind is Kind.POV_BRAKES
 
     def test_none_that_loses_less_than_1_mps(self):
         a_little = phases((3.0, 0.0), (0.9, -1.0), (4.1, 0.0))
-        assert diagnosed(meeting(a_little, LEVEL0)).pov_brakes_s is None
+        assert diagnosed(meeting(a_little, LEVEL0)).pov.brakes_s is None
         more = phases((3.0, 0.0), (1.0, -1.0), (4.0, 0.0))
-        assert diagnosed(meeting(more, LEVEL0)).pov_brakes_s == 3.0
+        assert diagnosed(meeting(more, LEVEL0)).pov.brakes_s == 3.0
 
     def test_one_that_regains_its_speed_from_when_it_loses_it_again(self):
         twice = phases((1.0, 0.0), (0.5, -1.0), (0.5, 1.0), (2.0, 0.0), (4.0, -1.0))
-        assert diagnosed(meeting(twice, LEVEL0)).pov_brakes_s == 4.0
+        assert diagnosed(meeting(twice, LEVEL0)).pov.brakes_s == 4.0
 
 
 class TestTheKind:
@@ -125,7 +126,7 @@ def over_the_pool(fails, level: int = 1) -> list[Outcome]:
     return [outcome(n, x, v, fails(x, v), level) for n, (x, v) in enumerate(places)]
 
 
-class TestRegions:
+class TestBoxes:
     def test_of_a_band_of_equal_arrival_speak_of_the_time(self):
         outcomes = over_the_pool(lambda x, v: 8.3 < -x / v < 8.8)
         (box,) = failure_boxes(outcomes, 1)

@@ -130,6 +130,6 @@ class TestRobustness:
         ],
     )
     def test_is_the_margin(self, formula, margin):
-        outcome = Criterion(require=formula).outcome(0, 0, ending(20.0))
+        outcome = Criterion(require=formula).outcome(ending(20.0))
         assert outcome.margin == pytest.approx(margin)
         assert outcome.failed is (margin < 0.0)

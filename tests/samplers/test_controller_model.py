@@ -108,7 +108,7 @@ class TestRollouts:
         plan = plan_for(f"{tmp_path / 'slows.py'}:vut", corridors=16)
         done = simulate(plan, pool.cases(points, 0))
         lines = centre_lines(road)
-        expected = [criterion.outcome(0, 0, one.trajectory, lines).signed_gap for one in done]
+        expected = [criterion.outcome(one.trajectory, lines).signed_gap for one in done]
         rollout = ModelRollout(pool, POVS, criterion, lines)
         (found,) = rollout.play({0: points}, [slows])
         assert found == pytest.approx(np.array(expected, dtype=np.float64), abs=1e-6)

@@ -115,5 +115,5 @@ class TestFollowUp:
             assert len(trajectory.after) < 10
             without = replace(trajectory, error=None)
             assert Measures.of(trajectory).score == Measures.of(without).score
-            words = cause(Criterion().outcome(0, 0, trajectory), trajectory)
+            words = cause(Criterion().outcome(trajectory), trajectory)
             assert words.endswith("After M an error ends the follow-up.")
