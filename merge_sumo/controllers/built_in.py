@@ -1,4 +1,4 @@
-"""The VUTs that the package brings: `VUTS` of each file in `drivers/`, where it has some."""
+"""The VUTs of this package: those in `VUTS` of each file in `drivers/` that has it."""
 
 from __future__ import annotations
 
@@ -25,31 +25,43 @@ BUILT_IN_VUTS = found()
 
 
 class BuiltInKind(ControllerKind):
-    """A VUT that the package brings, with its parameters."""
+    """A VUT of this package, with its parameters."""
 
     own_code = asks_sumo = False
 
     def __init__(self, spec: ControllerSpec, options: ControllerOptions) -> None:
-        """Take the parameters; `UserError` for those that it cannot have."""
+        """Take the parameters.
+
+        Args:
+            spec: a name of `BUILT_IN_VUTS` and parameters.
+            options: how it is hosted.
+
+        Raises:
+            UserError: for a parameter or a value that it cannot have.
+        """
         super().__init__(spec, options)
         self._built_in = built_in = BUILT_IN_VUTS[spec.argument]
-        self._design = design = built_in.design
-        known = {} if design is None else asdict(design)
-        chosen = {name: float(value) for name, value in spec.numbers().items()}
-        for name in chosen:
-            if name not in known:
-                raise spec.unknown_parameter(name, known)
-        if design is not None:
+        self._design = built_in.design
+        self.settable = settable = {} if self._design is None else asdict(self._design)
+        for name, value in spec.numbers().items():
+            if name not in settable:
+                raise spec.unknown_parameter(name, settable)
+            settable[name] = float(value)
+        if self._design is not None:
             try:
-                self._design = replace(design, **chosen)
+                self._design = replace(self._design, **settable)
             except UserError as error:
                 raise UserError(f"{spec}: {error}") from error
-        self.settable = known | chosen
         if built_in.ramp_only:
             self.no_pov = "that is a VUT for the ramp; the POVs of levels 0 to 2 need no name"
 
     def driver(self, corridors: int, _simulation: object) -> Driver:
-        """Return its driver for a number of corridors."""
+        """Return its driver.
+
+        Args:
+            corridors: number of corridors.
+            _simulation: not used.
+        """
         make = self._built_in.make
         if self._design is not None:
             return make(corridors, self._design)

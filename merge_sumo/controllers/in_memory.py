@@ -1,7 +1,7 @@
 """VUTs that are objects of this Python process: a class of a notebook, a lambda, an instance.
 
-An importable one is named, `module:Name`, and hosted as on the command line. Others get a name of
-this process, `here:Name`, and drive in it.
+An importable object is named `module:Name` and hosted as on the command line; any other one is
+named `here:Name` and drives in this process.
 """
 
 from __future__ import annotations
@@ -25,14 +25,22 @@ class Acts(Protocol):
     """A controller of one corridor."""
 
     def act(self, seen: Seen, /) -> Answer:
-        """Return the acceleration for the next 0.1 s, in m/s2, or it and whether to merge."""
+        """Return the acceleration for the next 0.1 s, in m/s2, or it and whether to merge.
+
+        Args:
+            seen: the observation at this step.
+        """
 
 
 class ActsInBatches(Protocol):
     """A controller of all K corridors at once."""
 
     def act_batch(self, seen: SeenBatch, /) -> Any:
-        """Return accelerations for 0.1 s, in m/s2, (K,), or these and whether to merge, (2, K)."""
+        """Return accelerations for 0.1 s, in m/s2, (K,), or these and whether to merge, (2, K).
+
+        Args:
+            seen: the observation of all corridors at this step.
+        """
 
 
 AnyVut = str | type[Any] | Callable[[Seen], Answer] | Acts | ActsInBatches
@@ -42,14 +50,16 @@ AnyVut = str | type[Any] | Callable[[Seen], Answer] | Acts | ActsInBatches
 def spec_of(vut: Any) -> str:
     """Return the spec of a VUT for this process and for those that it starts.
 
-    Raises `UserError` for other objects.
+    Args:
+        vut: a spec, or an object that drives.
+
+    Raises:
+        UserError: for another object.
     """
     if isinstance(vut, str):
         return vut
-    if is_code(vut):
-        importable = _importable(vut)
-        if importable is not None:
-            return importable
+    if is_code(vut) and (importable := _importable(vut)) is not None:
+        return importable
     name = str(getattr(vut, "__qualname__", type(vut).__qualname__)).rpartition(".")[2]
     name = "lambda" if name == "<lambda>" else name
     number, unique = 1, name
@@ -67,14 +77,19 @@ def spec_of(vut: Any) -> str:
 
 
 def is_in_process(text: str) -> bool:
-    """Return whether a spec names an object of this process."""
+    """Return whether a spec names an object of this process.
+
+    Args:
+        text: the spec.
+    """
     return parse(text).kind == HERE
 
 
 def names_code(text: str) -> bool:
-    """Return whether a spec, as others may have written it, decides on code of a user's to run.
+    """Return whether a received spec names code that would run; an object of this process does not.
 
-    An object of this process was put there by its user.
+    Args:
+        text: the spec.
     """
     return runs_code(text) and object_of(parse(text)) is None
 
@@ -97,7 +112,7 @@ def spec_of_driver(vut: Any) -> str:
 
 
 def _importable(target: Any) -> str | None:
-    """Return MODULE:NAME of a class or a function; None where no other process finds it so."""
+    """Return MODULE:NAME of a class or a function; None if other processes cannot import it."""
     module, name = getattr(target, "__module__", None), getattr(target, "__qualname__", "")
     if module in (None, "__main__", "__mp_main__") or "<" in name:
         return None

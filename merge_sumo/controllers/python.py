@@ -14,7 +14,7 @@ from functools import cache, partial
 from importlib.metadata import EntryPoint
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,11 +46,15 @@ from merge_sumo.scenario.scenario import DT_S, VUT
 from merge_sumo.scenario.signals import StepSignals, as_signals
 
 objects: dict[str, Any] = {}
-"""The objects of this process that are controllers, by the arguments of their specs."""
+"""Objects of this process that are controllers, by the arguments of their specs."""
 
 
 def object_of(spec: ControllerSpec) -> Any:
-    """Return the object that a spec names; None for a spec that every process can load."""
+    """Return the object of this process that a spec names; None for a spec of another kind.
+
+    Args:
+        spec: any spec.
+    """
     return objects.get(spec.argument) if spec.kind == HERE else None
 
 
@@ -63,19 +67,27 @@ def installed_vuts() -> dict[str, EntryPoint]:
 
 
 class OfPython(ControllerKind):
-    """A class, a function or an object, which a subclass finds.
+    """A class, a function or an object that drives; a subclass finds it.
 
-    Each corridor has an object of its own: a new one of a class, a copy of an object. One that acts
-    in all corridors at once is not copied, unless parameters are given.
+    Each corridor has an object of its own: a new one of a class, a copy of an object. An object
+    that acts in all corridors at once is not copied, unless parameters are given.
 
-    A parameter is a keyword of the constructor, or of the function. One that the constructor does
-    not have is an attribute, with a number, that the object has once it is made.
+    A parameter is a keyword of the constructor, or of the function. A parameter that the
+    constructor does not have is a numeric attribute of the object that is made.
     """
 
     asks_sumo = False
 
     def __init__(self, spec: ControllerSpec, options: ControllerOptions) -> None:
-        """Check the target and the parameters; `UserError` where it cannot be called as a VUT."""
+        """Check the target and the parameters.
+
+        Args:
+            spec: names the target, and its parameters.
+            options: how it is hosted.
+
+        Raises:
+            UserError: if it cannot be called as a VUT, or has no such parameter.
+        """
         super().__init__(spec, options)
         self._target = target = self.target()
         self._is_function, self._is_class = inspect.isroutine(target), isinstance(target, type)
@@ -87,7 +99,8 @@ class OfPython(ControllerKind):
         acts = self._is_batched or callable(getattr(target, "act", None))
         if not acts and (self._is_class or not callable(target) or not fits(target, 1)):
             raise self.refused(target)
-        by_place = int(not self._is_class or self._is_batched)  # an observation, or the corridors
+        # An observation, or the number of corridors, is positional.
+        by_place = int(not self._is_class or self._is_batched)
         defaults = defaults_of(target, by_place)
         self._keywords: dict[str, float] = {}
         self._attributes: dict[str, float] = {}
@@ -104,11 +117,19 @@ class OfPython(ControllerKind):
                 self._numbers[name] = number
 
     def target(self) -> Any:
-        """Return the class, function or object; `UserError` where it cannot be loaded."""
+        """Return the class, function or object.
+
+        Raises:
+            UserError: if it cannot be loaded.
+        """
         raise NotImplementedError
 
     def refused(self, target: Any) -> UserError:
-        """Return the error for a target that is not a VUT."""
+        """Return the error for a target that is not a VUT.
+
+        Args:
+            target: any object.
+        """
         return UserError(
             f"{self.spec.argument} is {text_of(target, repr)[:80]}: a VUT is a class or an object "
             "with `act(self, seen)` or `act_batch(self, seen)`, or a function `f(seen)`"
@@ -119,13 +140,25 @@ class OfPython(ControllerKind):
         return PythonController(self)
 
     def driver(self, corridors: int, simulation: object) -> Driver:
-        """Return the driver of all corridors."""
+        """Return the driver of all corridors.
+
+        Args:
+            corridors: number of corridors.
+            simulation: not used.
+        """
         if self._is_batched:
             return BatchedVut(corridors, self)
         return super().driver(corridors, simulation)
 
     def make(self, *corridors: int) -> Any:
-        """Return a new object, made with the number of corridors where it acts in all of them."""
+        """Return a new object, or the function with its keywords.
+
+        Args:
+            *corridors: the number of corridors, for a class that acts in all of them.
+
+        Raises:
+            UserError: if it cannot be made, or has no such parameter.
+        """
         target = self._target
         if self._is_function:
             return partial(target, **self._keywords) if self._keywords else target
@@ -137,26 +170,28 @@ class OfPython(ControllerKind):
                 made = target(*corridors, **self._keywords)
             present = self.present(made)
             for name, value in self._attributes.items():
-                if name in present:
-                    setattr(made, name, value)
+                if name not in present:
+                    raise self.spec.unknown_parameter(name, present)
+                setattr(made, name, value)
+        except UserError:
+            raise
         except (Exception, SystemExit) as error:
-            how = "copied for each corridor (give its class)"
-            if self._is_class:
-                how = f"made with {corridors[0]} corridors" if corridors else "made"
+            how = "made" if self._is_class else "copied for each corridor (give its class)"
             why = f"{type(error).__name__}: {text_of(error)}"
             raise UserError(f"{self.spec} cannot be {how}: {why}") from error
-        for name in self._attributes:
-            if name not in present:
-                raise self.spec.unknown_parameter(name, present)
         return made
 
     def present(self, made: Any) -> dict[str, float]:
-        """Return the parameters of a made object, or of the function, with their values."""
+        """Return the parameters of a made object, or of the function, with their values.
+
+        Args:
+            made: what `make` returned.
+        """
         return ({} if self._is_function else attributes_of(made)) | self._numbers
 
 
 class PythonKind(OfPython):
-    """`module:Name` or `file.py:Name`."""
+    """A class or a function of a module or a file: `module:Name` or `file.py:Name`."""
 
     form = "MODULE:NAME[?PARAMETER=VALUE&...] or FILE.py:NAME"
     what = "a class with act(seen), a function of seen, or a batched class"
@@ -164,11 +199,18 @@ class PythonKind(OfPython):
     hosted = True
 
     def target(self) -> Any:
-        """Return the object of that name in the module."""
+        """Return the class or function that the spec names."""
         return self.code_at(self.spec.argument)
 
     def code_at(self, place: str) -> Any:
-        """Return the class or function MODULE:NAME, and note its file; `UserError` without one."""
+        """Return a class or function, and note its file.
+
+        Args:
+            place: MODULE:NAME or FILE.py:NAME.
+
+        Raises:
+            UserError: if the module cannot be loaded, or has no such class or function.
+        """
         source, _, name = place.rpartition(":")
         module = _module_of(source)
         target: Any = module
@@ -184,7 +226,7 @@ class PythonKind(OfPython):
 
 
 class InstalledKind(PythonKind):
-    """A name that an installed package registers."""
+    """A VUT that an installed package registers, by its name."""
 
     form = what = example = ""
 
@@ -200,7 +242,11 @@ class InProcessKind(OfPython):
     files_are_known, max_workers = False, 1
 
     def target(self) -> Any:
-        """Return the object; `UserError` where that was an object of another process."""
+        """Return the object.
+
+        Raises:
+            UserError: if it was an object of another process.
+        """
         if self.spec.argument not in objects:
             raise UserError(
                 f"{self.spec} was an object of a Python process: name a VUT, or give the object "
@@ -217,24 +263,32 @@ class InProcessKind(OfPython):
 class PythonController(Controller):
     """An object with `act(seen)`, or one that is called itself.
 
-    An object without `reset` keeps its state, so each episode has a new one; a function has nothing
-    to reset.
+    An object without `reset` cannot forget an episode, so each episode has a new one; a function
+    has nothing to forget.
     """
 
     def __init__(self, kind: OfPython) -> None:
-        """Make the object of a kind."""
+        """Make the object.
+
+        Args:
+            kind: makes it.
+        """
         self._kind, self._thing = kind, kind.make()
-        # No frame of ours lies between the driver and the user's function.
+        # The driver calls the user's function itself: a frame less in each step.
         self.act = getattr(self._thing, "act", self._thing)  # type: ignore[method-assign]
         is_function = inspect.isroutine(self._thing) or isinstance(self._thing, partial)
         self.single_use = not is_function and getattr(self._thing, "reset", None) is None
 
     def reset(self, start: Start) -> None:
-        """Call `reset`, if there is one."""
+        """Call `reset`, if the object has it.
+
+        Args:
+            start: first observation of the episode.
+        """
         _reset(self._thing, start.seen, seed=start.seed)
 
     def signals(self) -> StepSignals:
-        """Return the `signals` that the object has left as an attribute."""
+        """Return the signals that the object has left in its attribute `signals`."""
         left = getattr(self._thing, "signals", None)
         return {} if left is None else as_signals(left)
 
@@ -243,32 +297,41 @@ class PythonController(Controller):
         return self._kind.present(self._thing)
 
     def close(self) -> None:
-        """Call `close`, if there is one."""
+        """Call `close`, if the object has it."""
         _close(self._thing)
 
 
 class BatchedVut(ControllerDriver):
     """Drives by one object that acts in all corridors at once.
 
-    It is made with the number of corridors K, has `act_batch(seen)`, which returns K
-    accelerations, (K,), or these and whether to merge, (2, K), and perhaps `reset(corridor, seen)`,
-    or `reset(corridor, seen, seed)`, and `close()`.
+    The object is made with the number of corridors K. Its `act_batch(seen)` returns accelerations,
+    (K,), or these and whether to merge, (2, K). It may have `reset(corridor, seen)`, or
+    `reset(corridor, seen, seed)`, and `close()`.
     """
 
     def __init__(self, corridors: int, kind: OfPython) -> None:
-        """Make the object of a kind."""
+        """Make the object.
+
+        Args:
+            corridors: number of corridors.
+            kind: makes it.
+        """
         super().__init__(corridors)
         self._kind, self._deadline = kind, Deadline(kind.options.deadline_s)
         self._object = kind.make(corridors)
         self._replace = False
         self._errors: dict[int, str] = {}
-        """By corridor: its reset failed, its merge request is invalid, or the last act failed."""
+        """By corridor: why its reset or the last act failed, or its merge request is invalid."""
         self._lanes_m = np.zeros((2, corridors))
 
     def reset(self, corridor: int, start: Start) -> None:
-        """Call `reset`, if there is one; an error is kept as the reason of the answer.
+        """Call `reset`, if the object has it; an error is kept as the reason of the answer.
 
-        After an act that failed all episodes begin, and a new object serves them.
+        After an act that failed, all episodes begin again, with a new object.
+
+        Args:
+            corridor: index of the corridor.
+            start: first observation of the episode.
         """
         self._errors.pop(corridor, None)
         self._lanes_m[:, corridor] = start.lane_m or (0.0, 0.0)
@@ -285,11 +348,17 @@ class BatchedVut(ControllerDriver):
     def act(self, scene: Scene) -> FloatArray:
         """Call `act_batch` on a copy of the scene.
 
+        Args:
+            scene: the state of all corridors.
+
+        Returns:
+            Accelerations, (K,), m/s2; NaN where there is a reason.
+
         Raises:
-            ControllerDiedError: it fails and several episodes run, so the one at fault is unknown.
+            ControllerDiedError: if it fails and several episodes run: any may be at fault.
         """
         self._merge_requests, k = None, self.corridors
-        seen = _batch(scene, self._lanes_m)
+        seen = SeenBatch.of(scene, self._lanes_m)
         try:
             with self._deadline as deadline:
                 deadline.start()
@@ -310,16 +379,14 @@ class BatchedVut(ControllerDriver):
         answer = answer.astype(np.float64)
         if answer.ndim == 2:
             answer, requests = answer
-            self._take(requests, scene.active)
+            self._take_requests(requests, scene.active)
         answer[list(self._errors)] = np.nan
         return answer
 
-    def _take(self, requests: FloatArray, active: NDArray[np.bool_]) -> None:
+    def _take_requests(self, requests: FloatArray, active: NDArray[np.bool_]) -> None:
         """Take whether to merge, 1 or 0, (K,), where an episode runs."""
         known = (requests == MERGE) | (requests == STAY)
-        self._merge_requests = np.where(active & known, requests == MERGE, NO_REQUEST).astype(
-            np.int8
-        )
+        self._merge_requests = np.where(active & known, requests, NO_REQUEST).astype(np.int8)
         for corridor in np.flatnonzero(active & ~known).tolist():
             wrong = f"requests {requests[corridor]} instead of 1 or 0, to merge or not"
             self._errors.setdefault(corridor, wrong)
@@ -329,11 +396,15 @@ class BatchedVut(ControllerDriver):
         return self._kind.present(self._object)
 
     def reason(self, corridor: int) -> str | None:
-        """Return the error of a corridor."""
+        """Return the error of a corridor; None without one.
+
+        Args:
+            corridor: index of the corridor.
+        """
         return self._errors.get(corridor)
 
     def close(self) -> None:
-        """Call `close`, if there is one."""
+        """Call `close`, if the object has it."""
         closed(self._deadline.deadline_s, partial(_close, self._object))
 
 
@@ -341,9 +412,26 @@ class BatchedVut(ControllerDriver):
 class SeenBatch:
     """Observation of a batched VUT: like `Seen`, with arrays over the K corridors, (K,).
 
-    In a corridor that is not `active` the numbers mean nothing. The arrays are copies. Of all cars
-    of the mainline, the one in front first, `x_others_m` and `v_others_mps` are (cars, K). Where
-    there is no acceleration lane `lane_begin_m` and `lane_end_m` are 0.
+    The arrays are copies.
+
+    Example:
+        ```python
+        def act_batch(self, seen: SeenBatch) -> FloatArray:
+            return np.where(seen.x_vut_m > seen.x_pov_m, 1.0, -1.0)
+        ```
+
+    Attributes:
+        active: whether an episode runs in the corridor; elsewhere the numbers mean nothing.
+        t_s: time since the episode began.
+        x_pov_m: distance of the POV's front bumper to M along its lane, negative before M.
+        v_pov_mps: speed of the POV.
+        x_vut_m: distance of the VUT's front bumper to M along its lane, negative before M.
+        v_vut_mps: speed of the VUT.
+        x_others_m: positions of all cars of the mainline, the one in front first, (cars, K).
+        v_others_mps: their speeds, (cars, K).
+        lane_begin_m: where the acceleration lane begins; 0 without one.
+        lane_end_m: where it ends; 0 without one.
+        merged: whether the VUT is on the mainline; without an acceleration lane it is from M on.
     """
 
     active: NDArray[np.bool_]
@@ -358,6 +446,34 @@ class SeenBatch:
     lane_end_m: FloatArray
     merged: NDArray[np.bool_]
 
+    @classmethod
+    def of(cls, scene: Scene, lanes_m: FloatArray) -> Self:
+        """Return the observation of a scene.
+
+        Args:
+            scene: the state of all corridors.
+            lanes_m: begin and end of the acceleration lanes, (2, K); 0 and 0 without one.
+        """
+        scene, (begin_m, end_m) = copy.deepcopy(scene), lanes_m.copy()
+        x_m, v_mps = np.delete(scene.x_m, VUT, axis=0), np.delete(scene.v_mps, VUT, axis=0)
+        order = np.argsort(-x_m, axis=0, kind="stable")
+        merged = scene.x_vut_m >= 0.0
+        if scene.merged is not None:
+            merged = np.where(begin_m < end_m, scene.merged, merged)
+        return cls(
+            active=scene.active,
+            t_s=np.round(scene.step * DT_S, 1),
+            x_pov_m=scene.x_pov_m,
+            v_pov_mps=scene.v_pov_mps,
+            x_vut_m=scene.x_vut_m,
+            v_vut_mps=scene.v_vut_mps,
+            x_others_m=np.take_along_axis(x_m, order, axis=0),
+            v_others_mps=np.take_along_axis(v_mps, order, axis=0),
+            lane_begin_m=begin_m,
+            lane_end_m=end_m,
+            merged=merged,
+        )
+
     @property
     def may_merge(self) -> NDArray[np.bool_]:
         """Whether a merge request, now, puts the VUT on the mainline in the next step, (K,)."""
@@ -365,30 +481,6 @@ class SeenBatch:
         next_m = self.x_vut_m + self.v_vut_mps * DT_S
         may: NDArray[np.bool_] = has_lane & ~self.merged & (next_m >= self.lane_begin_m)
         return may
-
-
-def _batch(scene: Scene, lanes_m: FloatArray) -> SeenBatch:
-    """Return the observation of a scene; `lanes_m`, (2, K), has begin and end of the lanes."""
-    active, step, x_m, v_mps, *_ = scene = copy.deepcopy(scene)
-    x_m, v_mps = np.delete(x_m, VUT, axis=0), np.delete(v_mps, VUT, axis=0)
-    order = np.argsort(-x_m, axis=0, kind="stable")
-    begin_m, end_m = lanes_m.copy()
-    merged = scene.x_vut_m >= 0.0
-    if scene.merged is not None:
-        merged = np.where(begin_m < end_m, scene.merged, merged)
-    return SeenBatch(
-        active=active,
-        t_s=np.round(step * DT_S, 1),
-        x_pov_m=scene.x_pov_m,
-        v_pov_mps=scene.v_pov_mps,
-        x_vut_m=scene.x_vut_m,
-        v_vut_mps=scene.v_vut_mps,
-        x_others_m=np.take_along_axis(x_m, order, axis=0),
-        v_others_mps=np.take_along_axis(v_mps, order, axis=0),
-        lane_begin_m=begin_m,
-        lane_end_m=end_m,
-        merged=merged,
-    )
 
 
 def _close(thing: Any) -> None:
@@ -405,7 +497,7 @@ def _reset(thing: Any, *arguments: Any, seed: int) -> None:
 
 
 def _module_of(source: str) -> ModuleType:
-    """Return the module of a file or of a name; `UserError` where it cannot be loaded."""
+    """Return the module of a file or of a name; raises `UserError` if it cannot be loaded."""
     try:
         if source.endswith(".py"):
             check_code(Path(source))
@@ -435,10 +527,15 @@ def _imported(name: str) -> ModuleType:
 
 
 def module_of_file(path: Path) -> ModuleType:
-    """Return the module that a file holds; it is executed once, and again when it has changed.
+    """Return the module of a file; it is executed once, and again when it has changed.
 
-    Modules next to it are found. Raises OSError where it cannot be read, and the errors of its
-    code.
+    It can import the modules next to it. What its code raises is not caught.
+
+    Args:
+        path: the file.
+
+    Raises:
+        OSError: if it cannot be read.
     """
     return _executed(path.resolve(), path.stat().st_mtime_ns)
 

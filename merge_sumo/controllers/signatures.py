@@ -1,10 +1,9 @@
-"""How a class, a function or an object is called, and which numbers it has."""
+"""How a class, a function or an object of a user is called, and which numbers it has."""
 
 from __future__ import annotations
 
 import inspect
 import math
-import os
 from collections.abc import Callable, Mapping
 from inspect import Parameter
 from pathlib import Path
@@ -22,14 +21,24 @@ OF_A_BATCH = {"act_batch": ("seen",), "reset": ("corridor", "seen"), "close": ()
 
 
 def is_code(target: Any) -> bool:
-    """Return whether something is a class or a function, and no other object."""
+    """Return whether an object is a class or a function.
+
+    Args:
+        target: any object.
+    """
     return isinstance(target, type) or inspect.isroutine(target)
 
 
 def check_methods(vut: Any) -> None:
-    """Raise `UserError` where a method of a class or object cannot be called as a VUT's is.
+    """Check that the methods of a class or object can be called as those of a VUT.
 
     Only plain methods are checked: others fail when they are called.
+
+    Args:
+        vut: the class or object.
+
+    Raises:
+        UserError: for a method that takes other arguments.
     """
     owner = vut if isinstance(vut, type) else type(vut)
     batched = callable(getattr(vut, "act_batch", None))
@@ -48,14 +57,23 @@ def _parameters(function: Callable[..., Any]) -> Mapping[str, Parameter]:
 
 
 def takes_seed(reset: Callable[..., Any]) -> bool:
-    """Return whether a `reset` has a parameter `seed`: then it is called with the episode's."""
+    """Return whether a method has a parameter `seed`: then it is called with the episode's.
+
+    Args:
+        reset: the method.
+    """
     return "seed" in _parameters(reset)
 
 
 def check_call(function: Callable[..., Any], arguments: tuple[str, ...]) -> None:
-    """Raise `UserError` where a function cannot be called with some arguments in order.
+    """Check that a function can be called with some arguments in order.
 
-    The sentence has the file and line of the function.
+    Args:
+        function: the function.
+        arguments: their names.
+
+    Raises:
+        UserError: if it takes others; the sentence has its file and line.
     """
     name = getattr(function, "__name__", "it")
     if fits(function, len(arguments), seeded=name == "reset"):
@@ -66,7 +84,7 @@ def check_call(function: Callable[..., Any], arguments: tuple[str, ...]) -> None
 
 
 def fits(function: Callable[..., Any], count: int, *, seeded: bool = False) -> bool:
-    """Return whether a function takes a number of positional arguments, as far as is known.
+    """Return whether a function takes a number of positional arguments; True where not known.
 
     Args:
         function: the function.
@@ -84,13 +102,11 @@ def fits(function: Callable[..., Any], count: int, *, seeded: bool = False) -> b
 
 
 def _place(function: Callable[..., Any]) -> str:
-    """Return "FILE:LINE: " of a function that is written in a file, else nothing."""
+    """Return "FILE:LINE: " of a function; "" for one that is not written in Python."""
     code = getattr(inspect.unwrap(function), "__code__", None)
-    if code is None or not Path(code.co_filename).is_file():
+    if code is None:
         return ""
-    path = os.path.relpath(code.co_filename)
-    path = code.co_filename if path.startswith(os.pardir) else path
-    return f"{path}:{code.co_firstlineno}: "
+    return f"{code.co_filename.removeprefix(f'{Path.cwd()}/')}:{code.co_firstlineno}: "
 
 
 def defaults_of(target: Any, by_place: int) -> dict[str, Any]:
@@ -98,7 +114,7 @@ def defaults_of(target: Any, by_place: int) -> dict[str, Any]:
 
     Args:
         target: the class, function or object.
-        by_place: number of its first arguments that are given by their place.
+        by_place: number of first arguments that are positional in a call.
     """
     defaults: dict[str, Any] = {}
     if is_code(target):
@@ -109,12 +125,13 @@ def defaults_of(target: Any, by_place: int) -> dict[str, Any]:
 
 
 def attributes_of(made: Any) -> dict[str, float]:
-    """Return the public attributes of an object that are numbers; no property of it runs."""
-    names: set[str] = set(getattr(made, "__dict__", ()))
-    for owner in type(made).__mro__:
-        names |= set(vars(owner))
+    """Return the public attributes of an object that are numbers, by name; no property runs.
+
+    Args:
+        made: the object.
+    """
     found: dict[str, float] = {}
-    for name in sorted(names, key=str):
+    for name in sorted(object.__dir__(made)):
         value = inspect.getattr_static(made, name, None)
         if isinstance(value, MemberDescriptorType):  # of __slots__
             value = getattr(made, name, None)
@@ -125,7 +142,11 @@ def attributes_of(made: Any) -> dict[str, float]:
 
 
 def number_of(value: Any) -> float | None:
-    """Return a value as a number; None unless it is a finite number."""
+    """Return a value as a number of Python; None unless it is a finite number.
+
+    Args:
+        value: any object.
+    """
     if isinstance(value, bool) or not isinstance(value, int | float | np.integer | np.floating):
         return None
     number = value.item() if isinstance(value, np.generic) else value

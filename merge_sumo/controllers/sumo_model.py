@@ -1,11 +1,4 @@
-"""SUMO's own drivers as VUT: a car-following model with SUMO's junction logic.
-
-At every step the model decides on a speed from the state, as it does in any SUMO simulation; the
-POV is a vehicle on the road for it, before M by the right of way of the zipper junction and after M
-as a leader. That speed is the VUT's answer: the acceleration to it is clipped and counted like
-any other, and eq. (4) moves the car. On an acceleration lane SUMO's lane-change model decides when
-to merge: the lane on which the VUT is after SUMO's step is its merge request.
-"""
+"""SUMO's own drivers as VUT: a car-following model with SUMO's junction logic."""
 
 from __future__ import annotations
 
@@ -16,7 +9,7 @@ from numpy.typing import NDArray
 
 from merge_sumo.controllers.spec import ControllerKind, ControllerOptions, ControllerSpec
 from merge_sumo.drivers.base import MERGE, STAY, Driver, Scene
-from merge_sumo.drivers.lane import END_MARGIN_M, stopping_mps
+from merge_sumo.drivers.lane import speed_to_stop_mps
 from merge_sumo.errors import UserError
 from merge_sumo.scenario.case import FloatArray
 from merge_sumo.scenario.scenario import DT_S, VUT
@@ -35,7 +28,7 @@ LANE_CHANGE_OPTIONS = (
     "lcOvertakeRight lcOvertakeDeltaSpeedFactor lcMaxSpeedLatStanding lcMaxSpeedLatFactor "
     "lcMaxDistLatStanding"
 )
-"""Options of SUMO's lane-change model LC2013; -1 turns some of them off. SUMO's other ones are
+"""Options of SUMO's lane-change model LC2013; -1 turns some of them off. SUMO's other options are
 those of its sublane model, which does not drive here."""
 ACC = (
     "speedControlGain gapClosingControlGainSpeed gapClosingControlGainSpace gapControlGainSpeed "
@@ -69,7 +62,15 @@ class SumoKind(ControllerKind):
     own_code = False
 
     def __init__(self, spec: ControllerSpec, options: ControllerOptions) -> None:
-        """Take model and options; `UserError` for others than SUMO's."""
+        """Take model and options.
+
+        Args:
+            spec: the model and its options.
+            options: how it is hosted.
+
+        Raises:
+            UserError: for a model, an option or a value that SUMO does not have.
+        """
         super().__init__(spec, options)
         model = spec.argument
         if model not in MODELS:
@@ -87,21 +88,39 @@ class SumoKind(ControllerKind):
             self.vut_type[name] = f"{value:.12g}"
 
     def driver(self, corridors: int, simulation: object) -> Driver:
-        """Return a driver in a simulation of SUMO."""
+        """Return a driver in a simulation of SUMO.
+
+        Args:
+            corridors: number of corridors.
+            simulation: a `SumoSimulation`.
+
+        Raises:
+            UserError: without one.
+        """
         if not isinstance(simulation, SumoSimulation):
             raise UserError(f"{self.spec} drives in a SUMO simulation only")
         return SumoVut(corridors, simulation)
 
 
 class SumoVut(Driver):
-    """Answers the accelerations on which SUMO decided in its step."""
+    """Answers the accelerations on which SUMO's models decide.
+
+    In each step the models decide on a speed from the state, as in any SUMO simulation. For the VUT
+    the POV is a vehicle on the road: before M with the right of way of the zipper junction, after M
+    as a leader. The answer is the acceleration to that speed; it is clipped and counted like any
+    other, and eq. (4) moves the vehicle. On an acceleration lane SUMO's lane-change model decides
+    when to merge: the merge request is the lane of the VUT after SUMO's step.
+    """
 
     def __init__(
         self, corridors: int, simulation: SumoSimulation, rows: Sequence[int] = (VUT,)
     ) -> None:
-        """Drive the vehicles in rows of a simulation that was opened with a vType for them.
+        """Drive vehicles of a simulation that was opened with a vType for them.
 
-        These are the VUTs, or the cars of the mainline: then `corridors` are those of all cars.
+        Args:
+            corridors: number of vehicles to drive.
+            simulation: the simulation.
+            rows: rows of the vehicles: that of the VUT, or those of cars of the mainline.
         """
         super().__init__(corridors)
         self.simulation, self._rows = simulation, list(rows)
@@ -109,26 +128,24 @@ class SumoVut(Driver):
         self._merges = np.zeros(simulation.corridors, dtype=np.bool_)
 
     def act(self, scene: Scene) -> FloatArray:
-        """Return the accelerations to the speeds that SUMO decided on."""
+        """Return the accelerations to the speeds that SUMO decided on, m/s2.
+
+        Args:
+            scene: the state of all corridors.
+        """
         v_mps = self.simulation.v_mps[self._rows].ravel()
         wanted_mps = self.simulation.wanted_v_mps(self._rows)
         if self._chooses:
             self._merges = self.simulation.requests_merge()
             stays = ~self._merges if scene.merged is None else ~(self._merges | scene.merged)
-            wanted_mps = np.where(stays, np.minimum(wanted_mps, self._stopping_mps()), wanted_mps)
+            # In a step SUMO moves by the new speed and eq. (4) by the old one, so a driver that
+            # brakes at the last moment would come a little beyond the end.
+            next_m = scene.x_vut_m + v_mps * DT_S
+            stops_mps = speed_to_stop_mps(next_m, self.simulation.scenario)
+            wanted_mps = np.where(stays, np.minimum(wanted_mps, stops_mps), wanted_mps)
         acceleration: FloatArray = (wanted_mps - v_mps) / DT_S
         return acceleration
 
     def merge_requests(self) -> NDArray[np.int8] | None:
         """Return whether SUMO's lane-change model merged, (K,); None without a lane."""
         return np.where(self._merges, MERGE, STAY).astype(np.int8) if self._chooses else None
-
-    def _stopping_mps(self) -> FloatArray:
-        """Return the highest speeds from which VUTs stop before the end of their lane, (K,).
-
-        In a step SUMO moves by the new speed and eq. (4) by the old one, so a driver that brakes at
-        the last moment would come a little beyond the end.
-        """
-        _, end_m = self.simulation.road.lane_m or (0.0, 0.0)
-        next_m = self.simulation.x_m[VUT] + self.simulation.v_mps[VUT] * DT_S
-        return stopping_mps(end_m - END_MARGIN_M - next_m, -self.simulation.scenario.a_min_mps2)

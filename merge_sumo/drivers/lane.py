@@ -119,6 +119,17 @@ def stopping_mps(room_m: FloatArray, brake_mps2: float) -> FloatArray:
     return np.sqrt(half**2 + 2.0 * brake_mps2 * np.maximum(room_m, 0.0)) - half
 
 
+def speed_to_stop_mps(next_m: FloatArray, scenario: Scenario) -> FloatArray:
+    """Return the highest speeds from which VUTs stop before the end of their lane, (K,).
+
+    Args:
+        next_m: positions of the VUTs after the next step, (K,).
+        scenario: gives the acceleration lane and the hardest braking.
+    """
+    _, end_m = scenario.lane_m or (0.0, 0.0)
+    return stopping_mps(end_m - END_MARGIN_M - next_m, -scenario.a_min_mps2)
+
+
 class PovAfterMerge(DriverWrapper):
     """Drives cars of the mainline at an acceleration lane by a driver that expects a merge at M.
 
@@ -219,8 +230,7 @@ class Merging:
             followed = follow_mps2(x_m, v_mps, self._scenario)
             answer[VUT] = np.where(self.driven_for, followed, answer[VUT])
         if self._stops:
-            stopping = stopping_mps(self.end_m - END_MARGIN_M - next_m, -self._scenario.a_min_mps2)
-            most = (stopping - v_mps[VUT]) / DT_S
+            most = (speed_to_stop_mps(next_m, self._scenario) - v_mps[VUT]) / DT_S
             leaves = self.merged | self._granted(next_m)
             answer[VUT] = np.where(leaves, answer[VUT], np.minimum(answer[VUT], most))
 

@@ -1,9 +1,6 @@
-"""A VUT behind TraCI: a controller written for SUMO, in any language, drives the vehicle `vut`.
+"""A VUT by TraCI: a controller written for SUMO, in any language, drives the vehicle `vut`.
 
-A process with a second SUMO serves it (`child.py`), in which its commands have SUMO's meaning. Each
-`simulationStep` of the client is a step of the rollout: the speed that SUMO gives the VUT becomes
-the acceleration of eq. (4), and its lane in SUMO the merge request. Between two episodes the road
-is empty for one step.
+A child process (`child.py`) serves it by a second SUMO, in which its commands have SUMO's meaning.
 """
 
 from __future__ import annotations
@@ -24,14 +21,13 @@ from merge_sumo.controllers.process import (
     ENDING_S,
     ProcessDiedError,
     Program,
-    append,
     code_of,
     split_command,
 )
 from merge_sumo.controllers.spec import ControllerKind, ControllerOptions, ControllerSpec
 from merge_sumo.controllers.traci.child import Child, FaultError, Reply
 from merge_sumo.drivers.base import MERGE, STAY, ControllerDiedError, Driver, Scene
-from merge_sumo.drivers.lane import END_MARGIN_M, stopping_mps
+from merge_sumo.drivers.lane import speed_to_stop_mps
 from merge_sumo.errors import UserError
 from merge_sumo.files import check_code
 from merge_sumo.road.road import Road
@@ -41,21 +37,25 @@ from merge_sumo.sumo.sumo_simulation import SumoSimulation
 
 HOST = "127.0.0.1"
 DEFAULT_PORT = 8813
-"""Port of TraCI clients that are given no other."""
+"""Port of TraCI clients by default."""
 KNOWS_USERS = sys.platform == "linux"
-"""Whether the system tells the user of a connection; elsewhere the first client is served."""
+"""Whether the system tells the user of a connection; on others the first client is served."""
 LOOK_S = 0.1
-"""Time between two looks whether a program that is waited for has ended."""
+"""Time between two checks whether a program that has not connected has ended."""
 START_S = 60.0
-"""Time that the serving process has to start, on whatever machine."""
+"""Time for the serving process to start, also on a slow machine."""
 WORK_S = 10.0
-"""Time that SUMO has for the questions of a controller in a step, in addition to the deadline."""
+"""Time for SUMO to answer a controller in a step, in addition to the deadline."""
 
 
 class TraciKind(ControllerKind):
-    """`traci`, `traci:PORT` or `traci:COMMAND`.
+    """A TraCI client: `traci`, `traci:PORT` or `traci:COMMAND`.
 
-    A command gets its port as an argument: any free one will do, and several can run at a time.
+    A command is told its port, so several can run at a time.
+
+    Attributes:
+        command: starts the client; None where the user does.
+        port: port at which a client connects; 0 for any free one.
     """
 
     form = "traci:COMMAND or traci[:PORT]"
@@ -75,60 +75,72 @@ class TraciKind(ControllerKind):
     def __init__(self, spec: ControllerSpec, options: ControllerOptions) -> None:
         """Read the port or the command.
 
-        Raises `UserError` for an invalid port or command, and for code that others may write.
+        Args:
+            spec: the port or the command.
+            options: how it is hosted.
+
+        Raises:
+            UserError: for an invalid port or command, and for code that others may write.
         """
         super().__init__(spec, options)
-        self._command, self._port = None, 0
+        self.command, self.port = None, 0
         if self.waits(spec.argument):
-            self._port = int(spec.argument or DEFAULT_PORT)
-            if not 1 <= self._port <= 65535:
+            self.port = int(spec.argument or DEFAULT_PORT)
+            if not 1 <= self.port <= 65535:
                 raise UserError(f"{spec}: the port is a number from 1 to 65535")
             self.max_workers = 1
         else:
-            self._command = split_command(spec.argument)
-            self.code = code_of(self._command)
+            self.command = split_command(spec.argument)
+            self.code = code_of(self.command)
         for file in self.code:
             check_code(file)
 
     @classmethod
     def waits(cls, argument: str) -> bool:
-        """Return whether an argument names the port at which a user's client is waited for."""
+        """Return whether the user starts the client: there is no command, at most a port.
+
+        Args:
+            argument: argument of a spec.
+        """
         return not argument or argument.isdecimal()
 
     def driver(self, _corridors: int, simulation: object) -> Driver:
-        """Return a driver in a simulation of SUMO."""
+        """Return a driver in a simulation of SUMO.
+
+        Args:
+            _corridors: 1.
+            simulation: a `SumoSimulation`.
+
+        Raises:
+            UserError: without one, or if no client connects in time.
+        """
         if not isinstance(simulation, SumoSimulation):
             raise UserError(f"{self.spec} drives in a SUMO simulation only")
-        road, scenario = simulation.road, simulation.scenario
-        return TraciVut(road, scenario, self._port, self._command, self.options)
+        return TraciVut(self, simulation.road, simulation.scenario)
 
 
 class TraciVut(Driver):
-    """Drives as a TraCI client commands; one client has one vehicle `vut`, so one corridor."""
+    """Drives as a TraCI client commands; one client has one vehicle `vut`, so one corridor.
 
-    def __init__(
-        self,
-        road: Road,
-        scenario: Scenario,
-        port: int,
-        command: list[str] | None,
-        options: ControllerOptions,
-    ) -> None:
+    Each `simulationStep` of the client is a step of the rollout. The speed that SUMO gives the VUT
+    becomes the acceleration of eq. (4), and the lane of the VUT in SUMO becomes the merge request.
+    Between two episodes the road is empty for one step.
+    """
+
+    def __init__(self, kind: TraciKind, road: Road, scenario: Scenario) -> None:
         """Start the command, or wait for a client.
 
         Args:
-            road: where the vehicles are.
+            kind: the command or the port, deadlines and the log.
+            road: the road of the vehicles.
             scenario: their number, lengths and limits.
-            port: where a client connects; 0 for any port.
-            command: starts the client; None where the user does.
-            options: deadlines and the log.
 
         Raises:
             UserError: if no client connects in time.
         """
         super().__init__(1)
-        self._port, self._command, self._options = port, command, options
-        self._log = options.log
+        self._kind, self._options = kind, kind.options
+        self._log = kind.options.log
         self._road, self._scenario = road, scenario
         self._child = Child(road, scenario)
         self._begins_m = np.full(scenario.vehicles, -road.mainline.before_m)
@@ -142,7 +154,7 @@ class TraciVut(Driver):
         """Speeds of the vehicles a step ago."""
         self._seed: int | None = None
         """Seed of an episode that begins."""
-        self._patience_s = options.connect_s
+        self._patience_s = self._options.connect_s
         try:
             self._connect()
         except (FaultError, ControllerDiedError) as error:
@@ -153,13 +165,25 @@ class TraciVut(Driver):
             raise
 
     def begin(self, corridor: int, case: Case) -> None:
-        """Note that the next scene is the first of an episode."""
+        """Note that the next scene is the first of an episode.
+
+        Args:
+            corridor: 0.
+            case: the case.
+        """
         self._reason, self._seed = None, case.controller_seed
         self._before_mps.clear()
         self._in_vain.clear()
 
     def act(self, scene: Scene) -> FloatArray:
-        """Return the acceleration that follows from the client's commands, or NaN."""
+        """Return the acceleration that follows from the client's commands, m/s2, or NaN.
+
+        Args:
+            scene: the state of the corridor.
+
+        Raises:
+            ControllerDiedError: if the serving process has ended.
+        """
         if self._reason is None:
             try:
                 return np.array([self._acceleration_mps2(scene)])
@@ -169,11 +193,19 @@ class TraciVut(Driver):
         return np.array([math.nan])
 
     def reason(self, corridor: int) -> str | None:
-        """Return the fault of the client."""
+        """Return the fault of the client in this episode; None without one.
+
+        Args:
+            corridor: 0.
+        """
         return self._reason
 
     def in_vain(self, corridor: int) -> Collection[str]:
-        """Return the commands of the client that changed nothing."""
+        """Return the commands of the client that changed nothing in this episode.
+
+        Args:
+            corridor: 0.
+        """
         return self._in_vain
 
     def close(self) -> None:
@@ -202,12 +234,10 @@ class TraciVut(Driver):
         wanted_mps = reply.v_mps
         if wanted_mps is None:  # it is beyond the end of the net: it keeps its speed
             return 0.0
-        lane_m = self._scenario.lane_m
-        if lane_m is not None and reply.by_sumo and not (merged or reply.merge):
+        if self._scenario.lane_m is not None and reply.by_sumo and not (merged or reply.merge):
             # As `SumoVut` does: by eq. (4) SUMO's driver would come a little beyond the lane's end.
-            room_m = lane_m[1] - END_MARGIN_M - (x_m[VUT] + v_mps[VUT] * DT_S)
-            stops_mps = stopping_mps(np.array(room_m), -self._scenario.a_min_mps2)
-            wanted_mps = min(wanted_mps, float(stops_mps))
+            next_m = np.array(x_m[VUT] + v_mps[VUT] * DT_S)
+            wanted_mps = min(wanted_mps, float(speed_to_stop_mps(next_m, self._scenario)))
         return float((wanted_mps - v_mps[VUT]) / DT_S)
 
     def _step(self, seed: int | None, **values: Any) -> Reply:
@@ -261,18 +291,18 @@ class TraciVut(Driver):
             self._child = Child(self._road, self._scenario)
         if self._listener is None:
             try:
-                self._listener = socket.create_server((HOST, self._port))
+                self._listener = socket.create_server((HOST, self._kind.port))
             except OSError as error:
                 raise UserError(
-                    f"cannot listen on {HOST}:{self._port} ({error.strerror}): choose another "
+                    f"cannot listen on {HOST}:{self._kind.port} ({error.strerror}): choose another "
                     "port, traci:PORT"
                 ) from error
         if self._program is not None and not self._accept(self._options.deadline_s):
             self._program.stop(ENDING_S)
         if self._client is None:
             port: int = self._listener.getsockname()[1]
-            if self._command is not None:
-                self._program = Program(self._command, port, self._log)
+            if self._kind.command is not None:
+                self._program = Program(self._kind.command, port, self._log)
                 self._log = self._log or Path(os.devnull)  # the same text again is not shown
             else:
                 sys.stderr.write(
@@ -305,8 +335,6 @@ class TraciVut(Driver):
                     self._ask("serve", START_S, client=client, deadline_s=deadline_s)
                     return True
                 client.close()
-                if self._options.log is not None:
-                    append(self._options.log, b"note: another user's connection is not served\n")
             if monotonic() > until or (self._program and self._program.ended(0.0)):
                 return False
 
@@ -328,9 +356,15 @@ class TraciVut(Driver):
 
 
 def users_of(client: socket.socket) -> set[int]:
-    """Return the users of the connections from the port of a client to the port of its server.
+    """Return the users who connect from the port of a client to the port of its server.
 
-    On other addresses of this machine there may be several. Empty where the client is gone.
+    Other addresses of this machine may have the same ports, so there may be several.
+
+    Args:
+        client: the connection, as its server has it.
+
+    Returns:
+        Their numbers; empty if the client is gone.
     """
     users = set()
     ports = [f"{port:04X}" for _, port in (client.getpeername()[:2], client.getsockname()[:2])]
