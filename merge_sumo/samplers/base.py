@@ -16,20 +16,30 @@ from merge_sumo.scenario.case import Case, FloatArray, Pool, to_unit
 
 
 class Predictor(Protocol):
-    """Predicts the gaps of cases; a pure function of the outcomes told so far.
+    """Predicts the gaps of cases before they run; a pure function of the outcomes told so far.
 
     Attributes:
-        members: number of members of its ensemble. They learn from different data, so they
+        members: number of members of its ensemble, M. They learn from different data, so that they
             disagree where they extrapolate.
     """
 
     members: int
 
     def tell(self, outcomes: Sequence[Outcome], motions: Mapping[int, FloatArray]) -> None:
-        """Take outcomes, and their motions, (T + 1, A, 3), by index."""
+        """Learn from outcomes.
+
+        Args:
+            outcomes: outcomes of any level.
+            motions: their motions, (T + 1, A, 3), by index: x in m, v in m/s and a in m/s2 of each
+                of the A vehicles.
+        """
 
     def can_predict(self, level: int) -> bool:
-        """Return whether the outcomes so far suffice to predict cases of a level."""
+        """Return whether the outcomes so far suffice to predict cases of a level.
+
+        Args:
+            level: level of the POV.
+        """
 
     def predict(
         self, points: Mapping[int, FloatArray], member: int | None = None
@@ -38,32 +48,40 @@ class Predictor(Protocol):
 
         Args:
             points: cases of the unit cube by level of the POV, (n, d) each.
-            member: the member that predicts, so that M is 1; None for all.
+            member: the only member that predicts, from 0 to M - 1; None for all.
 
         Returns:
-            Gaps by level, (M, n) each; NaN where the VUT never arrives.
+            Gaps by level, (M, n) each, or (1, n) by one member; NaN where the VUT never arrives.
         """
 
 
 class Sampler(ABC):
-    """Proposes cases; runs nothing.
+    """Proposes the cases of a campaign, and learns from their outcomes; it simulates nothing.
 
     `ask` is a pure function of the settings, of the outcomes told so far, and of the pending cases:
-    two calls return the same cases, and neither the order of `tell` nor a repeated `tell` matters.
-    A campaign resumes by telling its journal to a new sampler.
+    two calls return the same cases, and neither the order of outcomes nor a repeated `tell`
+    matters. A campaign resumes by telling the outcomes of its journal to a new sampler.
+
+    A new sampler implements `ask`, or as a `LevelwiseSampler` only `propose`.
 
     Attributes:
-        about: description in a line without a full stop, for help and documentation.
-        colour: of its curves in figures, #RRGGBB.
+        about: what it does, in a line without a full stop, for help and documentation.
+        colour: colour of its curves in figures, #RRGGBB.
         learns: whether proposals depend on the outcomes, and not only on their number.
-        uses_predictions: whether proposals depend on predictions of a model of the controller.
-        overlaps: whether it proposes while cases run, and keeps away from these (`pend`).
+        uses_predictions: whether proposals depend on the predictions of a `Predictor`.
+        overlaps: whether it proposes while cases run, and avoids the neighbourhood of these.
         tolerated: share of the runs of a case that may fail before the case counts as failed.
+        pool: the cases to choose from.
+        seed: seed of all random numbers.
+        predictor: predicts cases before they run; None without `uses_predictions`.
 
     Example:
         sampler = make_sampler("coverage", pool, seed=1)
-        cases = sampler.ask(sampler.batch_size())
-        sampler.tell(outcomes)
+        while len(outcomes) < 300:
+            cases = sampler.ask(sampler.batch_size())
+            ran = simulate_cases(cases, first_index=len(outcomes))
+            sampler.tell(ran)
+            outcomes += ran
     """
 
     about: ClassVar[str] = ""
@@ -79,7 +97,8 @@ class Sampler(ABC):
         Args:
             pool: the cases to choose from.
             seed: the same seed gives the same proposals.
-            predictor: predicts cases before they run, for samplers with `uses_predictions`.
+            predictor: predicts cases before they run; other samplers than those with
+                `uses_predictions` ignore it.
         """
         self.pool = pool
         self.seed = seed
@@ -90,10 +109,24 @@ class Sampler(ABC):
 
     @abstractmethod
     def ask(self, n: int) -> list[Case]:
-        """Return the next `n` cases."""
+        """Propose cases.
+
+        Args:
+            n: number of cases.
+
+        Returns:
+            The next `n` cases, none of which was proposed before.
+        """
 
     def prediction(self, place: int) -> Prediction | None:
-        """Return the prediction of a case of the last batch, by its place in the batch."""
+        """Return the prediction of a case of the last `ask`.
+
+        Args:
+            place: its place in the returned list.
+
+        Returns:
+            The prediction; None where the case was not predicted.
+        """
         return None
 
     def batch_size(self) -> int:
@@ -103,11 +136,12 @@ class Sampler(ABC):
     def tell(
         self, outcomes: Sequence[Outcome], motions: Mapping[int, FloatArray] | None = None
     ) -> None:
-        """Take outcomes; those without a verdict (VUT_ERROR, SIM_ERROR) only count as proposed.
+        """Learn from outcomes.
 
         Args:
-            outcomes: the outcomes.
-            motions: their motions, (T + 1, A, 3), by index, for the predictor.
+            outcomes: outcomes in any order. Those without a verdict, VUT_ERROR and SIM_ERROR, only
+                count as proposed. An outcome replaces an earlier one of the same index.
+            motions: their motions, (T + 1, A, 3), by index, for the predictor; None without one.
         """
         for outcome in outcomes:
             self._proposed[outcome.case.level] += outcome.index not in self._outcomes
@@ -116,19 +150,33 @@ class Sampler(ABC):
             self.predictor.tell(outcomes, motions)
 
     def pend(self, cases: Iterable[Case]) -> None:
-        """Take the cases that run at present; they replace those of the last call.
+        """Replace the pending cases.
 
-        They count as proposed; a sampler that `overlaps` also keeps away from them.
+        They count as proposed, and a sampler that `overlaps` avoids their neighbourhood.
+
+        Args:
+            cases: all cases that were proposed and have no outcome yet.
         """
         self._pending = list(cases)
 
     def pending(self, level: int) -> FloatArray:
-        """Return the pending cases of a level as points of its unit cube, (m, d)."""
+        """Return the pending cases of a level.
+
+        Args:
+            level: level of the POV.
+
+        Returns:
+            Points of the unit cube of the level, (m, d).
+        """
         cases = [case for case in self._pending if case.level == level]
         return to_unit(cases, level, self.pool.scenario)
 
     def observed(self, level: int | None = None) -> list[Outcome]:
-        """Return the outcomes with a verdict, of one level or of all, in order of their index."""
+        """Return the outcomes with a verdict, in order of their index.
+
+        Args:
+            level: level of the POV; None for all levels.
+        """
         observed = []
         for index in sorted(self._outcomes):
             outcome = self._outcomes[index]
@@ -137,48 +185,52 @@ class Sampler(ABC):
         return observed
 
     def proposed(self, level: int | None = None) -> int:
-        """Return the number of cases of one level or of all that were told or are pending."""
+        """Return the number of cases that were told or are pending.
+
+        Args:
+            level: level of the POV; None for all levels.
+        """
         pending = sum(level in (None, case.level) for case in self._pending)
         return pending + (self._proposed.total() if level is None else self._proposed[level])
 
     def history(self, level: int) -> LevelHistory:
-        """Return the outcomes with a verdict at one level as arrays, a row for each case.
+        """Return the cases of a level that have a verdict as arrays, with a row for each case.
 
-        The worst run of a case gives its margin and its gap.
+        Args:
+            level: level of the POV.
         """
-        every = by_case(self.observed())
-        cases = [case for case in every if case.case.level == level]
+        of_all_levels = by_case(self.observed())
+        cases = [case for case in of_all_levels if case.case.level == level]
         worst = [case.deciding() for case in cases]
-        variance = np.full(len(cases), np.nan)
-        for row, case in enumerate(cases):
-            if case.runs > 1:
-                margins = np.array([run.margin for run in case.outcomes], dtype=float)
-                variance[row] = np.var(bounded(margins), ddof=1)
+        variance = []
+        for case in cases:
+            margins = bounded(np.array([run.margin for run in case.outcomes], dtype=float))
+            variance.append(np.var(margins, ddof=1) if case.runs > 1 else np.nan)
         return LevelHistory(
             points=to_unit([run.case for run in worst], level, self.pool.scenario),
             margin=bounded(np.array([run.margin for run in worst], dtype=float)),
             failed=np.array([case.share > self.tolerated for case in cases], dtype=bool),
-            # None becomes NaN.
+            # A gap of None, of a VUT that never arrived, becomes NaN.
             gap=np.array([run.signed_gap for run in worst], dtype=float),
             batch=np.array([case.outcomes[0].batch for case in cases], dtype=int),
             runs=np.array([case.runs for case in cases], dtype=int),
             failures=np.array([case.failures for case in cases], dtype=int),
-            variance=variance,
-            varies=any(case.varies for case in every),
+            variance=np.array(variance, dtype=float),
+            varies=any(case.varies for case in of_all_levels),
         )
 
     def shares(self, n: int, weights: Mapping[int, float] | None = None) -> dict[int, int]:
-        """Share `n` cases out over the levels, in whole numbers (Wang et al., section V-D).
+        """Divide a batch among the levels (Wang et al., section V-D).
 
-        Each level gets one case first, those with the fewest proposed cases before the others. The
-        rest follows the largest remainders.
+        Each level first gets one case; with fewer cases than levels, the levels with the fewest
+        proposed cases get them. The rest is divided by the largest remainders.
 
         Args:
             n: number of cases.
-            weights: positive weight of each level; equal ones by default.
+            weights: positive weights by level; equal ones by default.
 
         Returns:
-            Number of cases by level; they add up to `n`.
+            Numbers of cases by level; their sum is `n`.
         """
         weights = weights or dict.fromkeys(self.pool.levels, 1.0)
         by_need = sorted(weights, key=lambda level: (self.proposed(level), level))
@@ -191,18 +243,34 @@ class Sampler(ABC):
         return shares
 
     def rng(self, *key: int) -> np.random.Generator:
-        """Return the generator of this proposal: seed, cases proposed so far, and a key.
+        """Return the random generator of the next proposal.
 
-        Cases without a verdict count, so that a batch of errors is not proposed again.
+        It depends on the seed and on the number of cases proposed so far. Cases without a verdict
+        count, so that a batch of errors is not proposed again.
+
+        Args:
+            key: distinguishes generators of one proposal, as those of its levels.
         """
         return np.random.default_rng([self.seed, self.proposed(), *key])
 
 
 class LevelwiseSampler(Sampler):
-    """Shares a batch out over the levels, then proposes points in each level's unit cube."""
+    """Divides a batch among the levels, then proposes points of the unit cube of each level.
+
+    Example:
+        class RandomSampler(LevelwiseSampler):
+            about = "draws cases at random"
+
+            def propose(self, history, n, rng, level):
+                return rng.random((n, history.dims))
+    """
 
     def ask(self, n: int) -> list[Case]:
-        """Return the next `n` cases, level by level."""
+        """Return the next `n` cases, level by level.
+
+        Args:
+            n: number of cases.
+        """
         cases: list[Case] = []
         for level, share in self.allocate(n).items():
             if share:
@@ -211,19 +279,23 @@ class LevelwiseSampler(Sampler):
         return cases
 
     def allocate(self, n: int) -> dict[int, int]:
-        """Return the number of cases for each level; they add up to `n`."""
+        """Return the number of cases for each level.
+
+        Args:
+            n: number of cases of the batch, which is the sum over the levels.
+        """
         return self.shares(n)
 
     @abstractmethod
     def propose(
         self, history: LevelHistory, n: int, rng: np.random.Generator, level: int
     ) -> FloatArray:
-        """Propose points of the level's unit cube.
+        """Propose points of the unit cube of a level.
 
         Args:
-            history: outcomes of the level; its points have d coordinates.
+            history: outcomes of the level; a point has `history.dims` coordinates, d.
             n: number of points.
-            rng: generator of this proposal.
+            rng: random generator of this proposal.
             level: level of the POV.
 
         Returns:
@@ -232,6 +304,13 @@ class LevelwiseSampler(Sampler):
 
 
 def reflect(points: FloatArray) -> FloatArray:
-    """Return points, (n, d), folded back into the unit cube at its faces."""
+    """Reflect points at the faces of the unit cube until they are inside.
+
+    Args:
+        points: points of any size, (n, d).
+
+    Returns:
+        Points of the unit cube, (n, d).
+    """
     folded = np.mod(points, 2.0)
     return np.minimum(folded, 2.0 - folded)

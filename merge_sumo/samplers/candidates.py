@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from scipy.spatial import cKDTree
 
@@ -15,12 +17,15 @@ REFINED_REACH = 0.6
 
 
 def surrogate_candidates(surrogate: Surrogate, n: int, rng: np.random.Generator) -> FloatArray:
-    """Return more than `n` candidates, (m, d), of the surrogate alone.
+    """Draw candidates by the surrogate alone.
 
     Args:
         surrogate: surrogate of the level.
         n: size of the batch.
         rng: random generator.
+
+    Returns:
+        Points, (m, d), more than `n`.
     """
     history = surrogate.history
     centres = history.points[history.failed]
@@ -59,7 +64,7 @@ def between(surrogate: Surrogate, n: int, rng: np.random.Generator) -> FloatArra
     """Draw points between safe cases of the two merging orders, most in narrow brackets.
 
     Args:
-        surrogate: P(fail), with the safe cases of either order.
+        surrogate: surrogate of the level, which knows the safe cases of either order.
         n: number of points.
         rng: random generator.
 
@@ -71,7 +76,7 @@ def between(surrogate: Surrogate, n: int, rng: np.random.Generator) -> FloatArra
     before, after = points[vut_first], points[pov_first]
     if not (len(before) and len(after)):
         return np.empty((0, points.shape[1]))
-    near = [*range(1, 1 + min(3, len(before), len(after)))]
+    near = range(1, 1 + min(3, len(before), len(after)))
     pairs = np.concatenate([_pairs(before, after, near), _pairs(after, before, near)[:, ::-1]])
     first, second = before[pairs[:, 0]], after[pairs[:, 1]]
     reach = REFINED_REACH * radius_for(points.shape[1])
@@ -83,7 +88,7 @@ def between(surrogate: Surrogate, n: int, rng: np.random.Generator) -> FloatArra
 
 
 def spread_out(n: int, dims: int, rng: np.random.Generator) -> FloatArray:
-    """Return the first points of a scrambled Halton sequence.
+    """Draw the first points of a scrambled Halton sequence.
 
     Args:
         n: number of points.
@@ -99,24 +104,23 @@ def spread_out(n: int, dims: int, rng: np.random.Generator) -> FloatArray:
     return points
 
 
-def anywhere(n: int, dims: int, on_faces: float, rng: np.random.Generator) -> FloatArray:
-    """Draw uniform points, a share of them on the faces and edges of the unit cube.
+def anywhere(n: int, dims: int, rng: np.random.Generator) -> FloatArray:
+    """Draw uniform points, 15 % of them on the faces and edges of the unit cube.
 
     Args:
         n: number of points.
         dims: their number of coordinates, d.
-        on_faces: share on the faces.
         rng: random generator.
 
     Returns:
         Points, (n, d).
     """
     points = rng.random((n, dims))
-    on_face = rng.random(points.shape) < on_faces / dims
+    on_face = rng.random(points.shape) < 0.15 / dims
     return np.where(on_face, rng.integers(0, 2, points.shape), points)
 
 
-def _pairs(points: FloatArray, others: FloatArray, near: list[int]) -> IntArray:
-    """Return pairs (index, index of one of its nearest neighbours), (m, 2)."""
-    _, index = cKDTree(others).query(points, k=near)
+def _pairs(points: FloatArray, others: FloatArray, near: Sequence[int]) -> IntArray:
+    """Return pairs (index of a point, index of its k-th nearest neighbour), (m, 2), for each k."""
+    _, index = cKDTree(others).query(points, k=list(near))
     return np.column_stack([np.repeat(np.arange(len(points)), len(near)), index.ravel()])

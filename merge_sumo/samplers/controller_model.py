@@ -47,23 +47,23 @@ Drive = Callable[[Inputs], FloatArray]
 """Gives accelerations of the VUT, (R,), for inputs, (R, inputs)."""
 
 
-class Observation:
-    """The inputs of the model in R episodes that advance together.
+class TreeInputs:
+    """The inputs of the trees in R episodes that advance together.
 
-    The first inputs are the state, the last acceleration, and the predictions that follow from
+    The first inputs are the last acceleration, the state, and the predictions that follow from
     them. The last ones, `PAST_INPUTS`, describe the past: a controller with a delay or a memory
     decides by it, too.
 
     Example:
-        observation = Observation(US23, rows=1)
-        inputs = observation.step(x_m, v_mps, a_last_mps2)
+        tree_inputs = TreeInputs(US23, rows=1)
+        inputs = tree_inputs.step(x_m, v_mps, a_last_mps2)
     """
 
     def __init__(self, scenario: Scenario, rows: int) -> None:
         """Begin `rows` episodes of a scenario."""
         self._scenario = scenario
         self._step = 0
-        # A ring of the last states that the past is made of, (steps, 5, R).
+        # A ring of what is remembered of the last steps, (steps, 5, R).
         self._past = np.empty((1 + max(LAGS), 5, rows), dtype=np.float32)
         self._since_jump = np.zeros(rows)
         self._lowest = np.zeros(rows)
@@ -80,12 +80,12 @@ class Observation:
         """Take the next states and return the inputs.
 
         Args:
-            x_m: positions, (A, R).
-            v_mps: speeds, (A, R).
-            a_last_mps2: last accelerations of the VUT, (R,).
+            x_m: positions in m, (A, R).
+            v_mps: speeds in m/s, (A, R).
+            a_last_mps2: last accelerations of the VUT in m/s2, (R,).
 
         Returns:
-            (R, inputs).
+            The inputs, (R, inputs).
         """
         scenario = self._scenario
         x_pov, v_pov, x_vut, v_vut = x_m[POV], v_mps[POV], x_m[VUT], v_mps[VUT]
@@ -198,14 +198,15 @@ class ModelRollout:
         after[:, :, 0] += DT_S * np.arange(steps + 1)[:, None] * at_m[:, 1]
         return after if steps else None
 
-    def _starts(self, level: int, points: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return x and v, (A, n), and psi, (n,), of cases, (n, d), of the unit cube."""
+    def _starts(self, level: int, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return states (x, v, a), (3, A, n), and psi, (n,), of cases of the unit cube, (n, d)."""
         scenario = self.scenario
         values = {}
         for dimension, units in zip(scenario.dimensions(level), points.T, strict=True):
             values[dimension.field] = dimension.low + units * (dimension.high - dimension.low)
         n, (v_vut0_mps, _) = len(points), scenario.bounds("v_vut0_mps")
-        x_m, v_mps = np.zeros((2, scenario.vehicles, n))
+        states = np.zeros((3, scenario.vehicles, n))
+        x_m, v_mps, _ = states
         x_m[POV], v_mps[POV] = values["x_pov0_m"], values["v_pov0_mps"]
         x_m[VUT] = scenario.x_vut0_m
         v_mps[VUT] = values.get("v_vut0_mps", v_vut0_mps)
@@ -213,7 +214,7 @@ class ModelRollout:
             v_mps[[AHEAD, BEHIND]] = v_mps[POV]
             x_m[AHEAD] = x_m[POV] + values["headway_ahead_s"] * v_mps[POV]
             x_m[BEHIND] = x_m[POV] - values["headway_behind_s"] * v_mps[POV]
-        return x_m, v_mps, values.get("svo_rad", np.zeros(n))
+        return states, values.get("svo_rad", np.zeros(n))
 
     def _play(
         self,
@@ -234,22 +235,21 @@ class ModelRollout:
         """
         scenario = self.scenario
         starts = [self._starts(level, of_level) for level, of_level in points.items()]
-        x_m, v_mps, svo_rad = (np.concatenate(part, axis=-1) for part in zip(*starts, strict=True))
-        cases = len(svo_rad)
-        x_m, v_mps = np.tile(x_m, len(drives)), np.tile(v_mps, len(drives))
-        svo_rad = np.tile(svo_rad, len(drives))
+        states, svo_rad = (np.concatenate(part, axis=-1) for part in zip(*starts, strict=True))
         levels = np.repeat(list(points), [len(of_level) for of_level in points.values()])
+        cases = len(levels)
+        states, svo_rad = np.tile(states, len(drives)), np.tile(svo_rad, len(drives))
+        x_m, v_mps, a_mps2 = states
         levels = np.tile(levels, len(drives))
-        a_mps2 = np.zeros_like(x_m)
         rows = np.arange(len(levels))
-        first_rows = np.arange(cases, len(rows), cases)
+        bounds = np.arange(0, len(rows) + 1, cases)
         gap_m = np.full(len(rows), np.nan)
         last = np.full(len(rows), scenario.max_steps)
         cars = np.flatnonzero(np.arange(len(x_m)) != VUT)
         held_mps2 = np.zeros((len(cars), len(rows)))
-        observation = Observation(scenario, len(rows))
+        tree_inputs = TreeInputs(scenario, len(rows))
         for step in range(scenario.max_steps):
-            inputs = observation.step(x_m, v_mps, a_mps2[VUT])
+            inputs = tree_inputs.step(x_m, v_mps, a_mps2[VUT])
             if step % DECISION_STEPS == 0:
                 for level, network in self._networks.items():
                     at = np.flatnonzero(levels[rows] == level)
@@ -260,30 +260,32 @@ class ModelRollout:
             a_mps2[cars] = held_mps2
             if len(cars) > 1:
                 keep_safe(a_mps2, x_m, v_mps, scenario)
-            parts = np.split(inputs, np.searchsorted(rows, first_rows))
-            for_vut = [np.ravel(drive(part)) for drive, part in zip(drives, parts, strict=True)]
-            a_mps2[VUT] = np.concatenate(for_vut)
-            a_mps2 = np.clip(a_mps2, scenario.a_min_mps2, scenario.a_max_mps2)
+            # The rows of a drive that still advance follow each other.
+            firsts = np.searchsorted(rows, bounds).tolist()
+            for drive, first, end in zip(drives, firsts[:-1], firsts[1:], strict=True):
+                a_mps2[VUT, first:end] = np.ravel(drive(inputs[first:end]))
+            np.clip(a_mps2, scenario.a_min_mps2, scenario.a_max_mps2, out=a_mps2)
             v_next_mps = np.maximum(v_mps + a_mps2 * DT_S, 0.0)
             # The recorded acceleration of a vehicle that comes to a stand.
-            a_mps2 = np.maximum(a_mps2, v_mps / -DT_S)
+            np.maximum(a_mps2, v_mps / -DT_S, out=a_mps2)
             if motion is not None:
-                motion[step][:, :, rows] = np.stack((x_m, v_mps, a_mps2), axis=1)
-            x_m, v_mps = x_m + v_mps * DT_S, v_next_mps
+                motion[step][:, :, rows] = states.transpose(1, 0, 2)
+            x_m += v_mps * DT_S
+            v_mps[:] = v_next_mps
             ended = x_m[VUT] >= 0.0
             if motion is None:
                 ended |= x_m[cars].min(axis=0) > FAR * scenario.dx_crash_m
             else:
-                motion[step + 1][:, :2, rows] = np.stack((x_m, v_mps), axis=1)
+                motion[step + 1][:, :2, rows] = states[:2].transpose(1, 0, 2)
             if ended.any():
                 gap_m[rows[ended]] = _gap_at_merge_m(x_m[:, ended], v_mps[:, ended])
                 last[rows[ended]] = step + 1
                 going = ~ended
                 if not going.any():
                     break
-                rows, held_mps2 = rows[going], held_mps2[:, going]
-                x_m, v_mps, a_mps2 = x_m[:, going], v_mps[:, going], a_mps2[:, going]
-                observation.keep(going)
+                rows, held_mps2, states = rows[going], held_mps2[:, going], states[:, :, going]
+                x_m, v_mps, a_mps2 = states
+                tree_inputs.keep(going)
         return gap_m, last
 
     def _decisions(
@@ -413,20 +415,19 @@ class ControllerModel:
         if not new:
             return
         motions = [self._motions[index] for index in new]
-        together = np.empty((len(new), max(map(len, motions)), *motions[0].shape[1:]))
-        for states, motion in zip(together, motions, strict=True):
-            states[: len(motion)] = motion
-            states[len(motion) :] = motion[-1]
-        observation = Observation(self._rollout.scenario, len(new))
+        steps = np.arange(max(map(len, motions)))
+        # A shorter motion keeps its last state.
+        padded = [motion[np.minimum(steps, len(motion) - 1)] for motion in motions]
+        tree_inputs = TreeInputs(self._rollout.scenario, len(new))
         last_mps2 = np.zeros(len(new))
         inputs = []
-        for state in together.transpose(1, 3, 2, 0)[:-1].copy():
-            inputs.append(observation.step(state[0], state[1], last_mps2))
-            last_mps2 = state[2, VUT]
+        for state in np.stack(padded, axis=-1)[:-1]:
+            inputs.append(tree_inputs.step(state[:, 0], state[:, 1], last_mps2))
+            last_mps2 = state[VUT, 2]
         for index, motion, of_case in zip(new, motions, np.stack(inputs, axis=1), strict=True):
-            steps = len(motion) - 1
+            until = len(motion) - 1
             # A copy: a view would keep the inputs of all.
-            self._steps[index] = of_case[:steps].copy(), motion[:steps, VUT, 2]
+            self._steps[index] = of_case[:until].copy(), motion[:until, VUT, 2]
 
 
 class ControllerModelPair:

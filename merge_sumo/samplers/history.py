@@ -1,4 +1,4 @@
-"""The outcomes that a sampler learns from, as arrays."""
+"""The outcomes of a level as arrays, which samplers learn from."""
 
 from __future__ import annotations
 
@@ -12,11 +12,17 @@ from merge_sumo.scenario.case import FloatArray
 
 
 def bounded(margin: FloatArray) -> FloatArray:
-    """Return margins, (...), with the large ones compressed, so that a process can learn them.
+    """Compress large margins, so that a Gaussian process can learn them.
 
-    They keep their order and signs, are continuous with their slope, and within 2.5.
+    Margins keep their order and their signs. The function is continuous, and so is its slope.
+
+    Args:
+        margin: margins of any shape; infinite ones are allowed.
+
+    Returns:
+        Margins of the same shape, within -2.5 and 2.5; up to 1.25, as all of the paper's are, they
+        stay as they are.
     """
-    # Smaller margins stay as they are; the paper's are all smaller.
     linear = 1.25
     size = np.maximum(np.abs(margin), linear)
     compressed = np.sign(margin) * (2.0 * linear - linear**2 / size)
@@ -25,23 +31,26 @@ def bounded(margin: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, slots=True)
 class LevelHistory:
-    """The outcomes of one POV level: N cases with a verdict, in the order of their first run.
+    """The N cases of one POV level that have a verdict, in the order of their first run.
 
-    A case that ran several times has one row. Its worst run gives its score and its gap, whatever
-    share is tolerated: a surrogate learns from it where a case can fail, and how often from
-    `failures` and `runs`.
+    A case that ran several times has one row, with the margin and the gap of its worst run:
+    a surrogate learns from these where cases can fail, and from `failures` and `runs` how often.
+
+    Example:
+        history = sampler.history(level=1)
+        failing = history.points[history.failed]
 
     Attributes:
         points: cases in the unit cube, (N, d).
-        margin: bounded margin of the worst run, below 0 for a failure, (N,): see `bounded`.
+        margin: margin of the worst run, below 0 for a failure, (N,); large ones are `bounded`.
         failed: whether more than the tolerated share of the runs failed, (N,).
-        gap: signed gap of the worst run, (N,), which fails within 1: see `Outcome.signed_gap`; NaN
-            where the VUT never arrived or there is no trajectory.
-        batch: batch of the campaign in which the case ran first, (N,).
+        gap: signed gap of the worst run, (N,), a failure within -1 and 1 (`Outcome.signed_gap`);
+            NaN where the VUT never arrived.
+        batch: number of the batch in which the case ran first, (N,).
         runs: number of runs of each case, (N,).
         failures: number of runs that failed, (N,).
         variance: variance of the margin over the runs of a case, (N,); NaN for a single run.
-        varies: whether runs of a case have differed, at this level or another.
+        varies: whether runs of a case differ, at this level or another.
     """
 
     points: FloatArray
@@ -56,17 +65,21 @@ class LevelHistory:
 
     @property
     def dims(self) -> int:
-        """Return d, the number of coordinates."""
+        """Number of coordinates of a case, d."""
         return int(self.points.shape[1])
-
-    @property
-    def has_gaps(self) -> bool:
-        """Return whether the VUT gives trajectories."""
-        return not np.isnan(self.gap).all()
 
 
 def most_informative(history: LevelHistory, most: int) -> LevelHistory:
-    """Return at most `most` cases: half of them the worst ones, half spread over the rest."""
+    """Limit a history, so that learning from it takes a limited time.
+
+    Args:
+        history: the cases.
+        most: largest number of cases.
+
+    Returns:
+        The history itself where it is short enough. Else half of `most` are the cases of the lowest
+        margins, and half are spread evenly over the others, in the order of the history.
+    """
     if len(history.points) <= most:
         return history
     order = np.argsort(history.margin, kind="stable")
@@ -75,6 +88,7 @@ def most_informative(history: LevelHistory, most: int) -> LevelHistory:
     evenly = np.linspace(0, len(rest) - 1, half).round().astype(np.int64)
     chosen = np.sort(np.concatenate([order[:half], rest[evenly]]))
     columns: dict[str, Any] = {}
-    for column in fields(history)[:-1]:
-        columns[column.name] = getattr(history, column.name)[chosen]
+    for column in fields(history):
+        if column.name != "varies":
+            columns[column.name] = getattr(history, column.name)[chosen]
     return replace(history, **columns)

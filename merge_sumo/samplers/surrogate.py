@@ -37,9 +37,8 @@ class Surrogate:
     Failures lie where the gap changes its sign, that is, where the merging order changes. There the
     gap may also jump, so that no case between the two sides fails.
 
-    Two Gaussian processes learn the gap (or the margin, of a VUT without trajectories): a smooth
-    and a rough one, weighted by their predictions of each case from all others. Two corrections are
-    fitted to these predictions:
+    Two Gaussian processes learn the gap: a smooth and a rough one, weighted by their predictions of
+    each case from all others. Two corrections are fitted to these predictions:
 
     - A case is bracketed where the nearest safe case of either merging order is nearer than any
       failure. Its P(fail) is multiplied by h / (h + w), with the width h of the bracket and the
@@ -54,34 +53,39 @@ class Surrogate:
     Attributes:
         history: the outcomes.
         groups: which cases failed, and which safe ones are of either merging order, each (N,).
-        gap_axis: mean slope of the gap, or of the margin, (d,), of length 1.
+        gap_axis: direction of the mean slope of the gap, (d,), of length 1.
+
+    Example:
+        chance = Surrogate(sampler.history(level=1)).predict(points)
     """
 
     def __init__(self, history: LevelHistory, limit: float | None = None) -> None:
-        """Learn from a history; with a `limit`, all cases up to that gap (margin) count as failed.
+        """Learn from a history.
 
         Args:
             history: outcomes of the level.
-            limit: None for the limit of the scenario.
+            limit: size of the signed gap up to which a case counts as failed; None for the verdicts
+                of the history.
         """
         if limit is not None:
-            failed = nearness(history) <= limit
+            failed = np.abs(signed_gaps(history)) <= limit
             history = replace(history, failed=failed, failures=np.where(failed, history.runs, 0))
         self.history = history
         self.groups = _groups(history)
         # 500 cases bound the time for a batch in a long campaign. The FMC after 1,100 cases of
         # design2 at level 2 is .0207 and .0209 (seeds 1, 2); with 1,000 .0208 and .0214.
         learned = most_informative(history, 500)
-        values, *self._interval = learned_values(learned, limit)
+        values = learned_values(learned, limit)
         distances = [_nearest_other(learned.points, group) for group in _groups(learned)]
         log_prior = -0.5 * (np.log(WIDTHS / 0.02) / 1.5) ** 2
         self._fitted: list[tuple[GaussianProcess, float, FloatArray]] = []
         posteriors = []
         for rough in (False, True):
             process = GaussianProcess(learned.points, values, rough=rough, noisy=history.varies)
-            lowered = _bracketed(self._within(*process.leave_one_out()), distances, WIDTHS[:, None])
-            evidence = _regression_inputs(lowered, distances, history.dims)
-            weights, posterior = fit_logistic(evidence, learned.failures, learned.runs)
+            chance = _chance_within(*process.leave_one_out())
+            lowered = _bracketed(chance, distances, WIDTHS[:, None])
+            inputs = _regression_inputs(lowered, distances, history.dims)
+            weights, posterior = fit_logistic(inputs, learned.failures, learned.runs)
             best = int((posterior + log_prior).argmax())
             self._fitted.append((process, float(WIDTHS[best]), weights[best]))
             posteriors.append((posterior + log_prior)[best])
@@ -89,57 +93,74 @@ class Surrogate:
         self.gap_axis = process.rotation[:, 0]
 
     def predict(self, points: FloatArray) -> FloatArray:
-        """Return P(fail) of a run of cases, (m, d), as (m,)."""
+        """Predict P(fail) of a run of each case.
+
+        Args:
+            points: cases of the unit cube, (m, d).
+
+        Returns:
+            Probabilities, (m,).
+        """
         distances = [nearest(points, self.history.points[group]) for group in self.groups]
         chances = []
         for process, width, weights in self._fitted:
-            chance = _bracketed(self._within(*process.predict(points)), distances, width)
-            chances.append(
-                expit(_regression_inputs(chance, distances, self.history.dims) @ weights)
-            )
+            chance = _bracketed(_chance_within(*process.predict(points)), distances, width)
+            inputs = _regression_inputs(chance, distances, self.history.dims)
+            chances.append(expit(inputs @ weights))
         return np.average(chances, axis=0, weights=self._process_weights)
-
-    def _within(self, mean: FloatArray, variance: FloatArray) -> FloatArray:
-        """Return the probability that a normal value is in the failing interval, (m,)."""
-        low, high = self._interval
-        deviation = np.sqrt(np.maximum(variance, 1e-12))
-        chance: FloatArray = ndtr((high - mean) / deviation) - ndtr((low - mean) / deviation)
-        return chance
 
 
 def learn_chance(history: LevelHistory) -> Callable[[FloatArray], FloatArray] | None:
-    """Return a function that gives P(fail), (n,), at points, (n, d), of the unit cube.
+    """Learn P(fail) for publication.
 
-    None with too few failures or too few safe cases.
+    Args:
+        history: outcomes of a level.
+
+    Returns:
+        A function from points, (n, d), of the unit cube to P(fail), (n,); None with fewer than
+        three failures or three safe cases.
     """
     if min(history.failed.sum(), (~history.failed).sum()) < JUDGED_FROM:
         return None
     return Surrogate(history).predict
 
 
-def learned_values(
-    history: LevelHistory, limit: float | None = None
-) -> tuple[FloatArray, float, float]:
-    """Return the values to learn, (N,), and the interval of them that means failure.
+def learned_values(history: LevelHistory, limit: float | None = None) -> FloatArray:
+    """Return the values that the processes learn.
 
-    They are the signed gaps in units of the limit, compressed like a logarithm: a gap of 100 m says
-    little more about failures than one of 50 m. Without gaps they follow from the margins.
+    The scale is logarithmic where gaps are large: a gap of 100 m says little more about failures
+    than one of 50 m.
+
+    Args:
+        history: outcomes of a level.
+        limit: size of the signed gap up to which a case counts as failed; None for 1.
+
+    Returns:
+        Values, (N,), of which those from -1 to 1 are failures.
     """
-    if not history.has_gaps:
-        return np.minimum((1.0 - history.margin) / (1.0 - (limit or 0.0)) - 1.0, 1.0), 0.0, np.inf
-    gap = np.nan_to_num(history.gap, nan=NO_GAP) / (limit or 1.0)
-    return np.arcsinh(gap) / np.arcsinh(1.0), -1.0, 1.0
+    values: FloatArray = np.arcsinh(signed_gaps(history) / (limit or 1.0)) / np.arcsinh(1.0)
+    return values
 
 
-def nearness(history: LevelHistory) -> FloatArray:
-    """Return the size of the gap, or else the margin, (N,): a failure has a small one."""
-    if not history.has_gaps:
-        return history.margin
-    return np.abs(np.nan_to_num(history.gap, nan=NO_GAP))
+def signed_gaps(history: LevelHistory) -> FloatArray:
+    """Return the signed gaps, (N,); `NO_GAP` for a VUT that never arrived.
+
+    Args:
+        history: outcomes of a level.
+    """
+    return np.nan_to_num(history.gap, nan=NO_GAP)
 
 
 def nearest(points: FloatArray, others: FloatArray) -> FloatArray:
-    """Return the distance of each point to the nearest of the others; 1 where there is none."""
+    """Return the distance of each point to the nearest of other points.
+
+    Args:
+        points: (n, d).
+        others: (m, d).
+
+    Returns:
+        Distances, (n,); 1 without other points.
+    """
     if not len(others):
         return np.ones(len(points))
     distance: FloatArray = cKDTree(others).query(points)[0]
@@ -147,15 +168,17 @@ def nearest(points: FloatArray, others: FloatArray) -> FloatArray:
 
 
 def _groups(history: LevelHistory) -> list[NDArray[np.bool_]]:
-    """Return which cases failed in a run, and which safe ones are of either order, each (N,).
-
-    Without a trajectory a safe case is of both merging orders.
-    """
+    """Return which cases failed in a run, and which safe ones are of either order, each (N,)."""
     failed = history.failures > 0
-    if not history.has_gaps:
-        return [failed, ~failed, ~failed]
-    pov_first = np.nan_to_num(history.gap, nan=NO_GAP) >= 0.0
+    pov_first = signed_gaps(history) >= 0.0
     return [failed, ~failed & ~pov_first, ~failed & pov_first]
+
+
+def _chance_within(mean: FloatArray, variance: FloatArray) -> FloatArray:
+    """Return the probability that a normal value is from -1 to 1, (m,)."""
+    deviation = np.sqrt(np.maximum(variance, 1e-12))
+    chance: FloatArray = ndtr((1.0 - mean) / deviation) - ndtr((-1.0 - mean) / deviation)
+    return chance
 
 
 def _nearest_other(points: FloatArray, group: NDArray[np.bool_]) -> FloatArray:
@@ -192,12 +215,12 @@ def _regression_inputs(chance: FloatArray, distances: list[FloatArray], dims: in
 
 
 def fit_logistic(
-    evidence: FloatArray, failures: NDArray[np.integer | np.bool_], runs: NDArray[np.int64]
+    inputs: FloatArray, failures: NDArray[np.integer | np.bool_], runs: NDArray[np.int64]
 ) -> tuple[FloatArray, FloatArray]:
     """Fit W logistic regressions at once, by Newton's method; a step that worsens one is halved.
 
     Args:
-        evidence: inputs of each regression, (W, N, 4).
+        inputs: inputs of each regression, (W, N, 4).
         failures: number of failures of each case, (N,).
         runs: number of its runs, (N,).
 
@@ -206,34 +229,34 @@ def fit_logistic(
     """
     mean, deviation = PRIOR_WEIGHTS
 
-    def posterior(evidence: FloatArray, weights: FloatArray) -> FloatArray:
+    def log_posterior(inputs: FloatArray, weights: FloatArray) -> FloatArray:
         prior = -0.5 * np.square((weights - mean) / deviation).sum(axis=1)
-        odds = (evidence @ weights[..., None])[..., 0]
+        odds = (inputs @ weights[..., None])[..., 0]
         likelihood = failures * log_expit(odds) + (runs - failures) * log_expit(-odds)
         density: FloatArray = likelihood.sum(axis=1) + prior
         return density
 
-    weights = np.tile(mean, (len(evidence), 1))
-    best = posterior(evidence, weights)
-    active = np.arange(len(evidence))
+    weights = np.tile(mean, (len(inputs), 1))
+    best = log_posterior(inputs, weights)
+    # Regressions that have not converged.
+    active = np.arange(len(inputs))
     for _ in range(6):
-        inputs, now = evidence[active], weights[active]
-        chance = expit((inputs @ now[..., None])[..., 0])
-        gradient = ((failures - runs * chance)[:, None] @ inputs)[:, 0] - (
-            now - mean
-        ) / deviation**2
-        hessian = (inputs * (runs * chance * (1.0 - chance))[..., None]).transpose(0, 2, 1) @ inputs
+        x, w = inputs[active], weights[active]
+        chance = expit((x @ w[..., None])[..., 0])
+        residual = failures - runs * chance
+        gradient = (residual[:, None] @ x)[:, 0] - (w - mean) / deviation**2
+        hessian = (x * (runs * chance * (1.0 - chance))[..., None]).transpose(0, 2, 1) @ x
         step = np.linalg.solve(hessian + np.diag(deviation**-2.0), gradient[..., None])[..., 0]
-        reached = posterior(inputs, now + step)
+        reached = log_posterior(x, w + step)
         while True:
             worse = (reached < best[active]) & (np.abs(step).max(axis=1) > SURE)
             if not worse.any():
                 break
             step[worse] *= 0.5
-            reached[worse] = posterior(inputs[worse], now[worse] + step[worse])
+            reached[worse] = log_posterior(x[worse], w[worse] + step[worse])
         better = reached > best[active]
-        active, now, reached = active[better], (now + step)[better], reached[better]
+        active = active[better]
         if not len(active):
             break
-        weights[active], best[active] = now, reached
+        weights[active], best[active] = (w + step)[better], reached[better]
     return weights, best

@@ -17,7 +17,7 @@ from merge_sumo.metrics.outcome import Outcome, Prediction
 from merge_sumo.records import decode, to_plain
 from merge_sumo.road.loader import centre_lines, road_for
 from merge_sumo.road.scenario_file import named_scenario
-from merge_sumo.samplers.controller_model import FAR, ControllerModel, ModelRollout, Observation
+from merge_sumo.samplers.controller_model import FAR, ControllerModel, ModelRollout, TreeInputs
 from merge_sumo.samplers.coverage import CoverageSampler
 from merge_sumo.scenario.case import (
     Pool,
@@ -129,7 +129,7 @@ class TestRollouts:
 
 class TestObservation:
     def test_sees_the_state_and_what_was_before(self):
-        observation = Observation(US23, 1)
+        observation = TreeInputs(US23, 1)
         for step in range(5):
             x = np.array([[-200.0 + step], [-100.0 + 2.0 * step]])
             v = np.array([[30.0], [20.0]])
