@@ -1,9 +1,9 @@
-"""How near the bodies of cars come before M, where two lanes already run together.
+"""Clearance of the bodies of cars before M, where two lanes already run together.
 
-A body is a rectangle whose front and rear bumpers are on the centre line of its lane. Of two of
-them the clearance is their distance, or where they overlap, as a negative number, how far one would
-have to move aside: the largest separation along their four axes (the separating axis theorem;
-Ericson, 2005, section 5.2.1). It is taken every 0.1 s.
+A body is a rectangle whose front and rear bumpers are on the centre line of its lane. The clearance
+of two bodies is their distance; where they overlap, it is negative, and its size is how far one of
+them would have to move aside. It is the largest separation along their four axes (the separating
+axis theorem; Ericson, 2005, section 5.2.1), every 0.1 s.
 """
 
 from __future__ import annotations
@@ -19,19 +19,24 @@ from merge_sumo.scenario.scenario import VUT
 from merge_sumo.scenario.trajectory import Trajectory
 
 WIDTH_M = 1.8
-"""Of every car."""
+"""Width of every car."""
 TOUCHING_M = WIDTH_M + 0.5
-"""Bodies may touch where the centre lines are nearer: in a bend they stand a little out of line."""
+"""Distance of centre lines below which bodies may touch; in a bend they stand out of line."""
 LOOKED_AT_M = 300.0
+"""Length before M in which the lanes are searched for where they run together."""
 SPACING_M = 0.25
+"""Distance of the points that are compared."""
 
 
 @dataclass(frozen=True, slots=True)
 class CentreLines:
-    """The centre lines of both paths in the plane: lane coordinate, x and y, (n, 3) each.
+    """The centre lines of both paths in the plane.
 
-    The lane coordinate, in m, is 0 at M and ascends. `together_m` is from how far before M on the
-    lines are so near each other that bodies may touch.
+    Attributes:
+        mainline: lane coordinate, x and y of points, (n, 3), in m; the lane coordinate ascends and
+            is 0 at M.
+        ramp: the same of the ramp.
+        together_m: distance before M from which on bodies on the lines may touch.
     """
 
     mainline: FloatArray
@@ -40,7 +45,12 @@ class CentreLines:
 
     @classmethod
     def of(cls, mainline: FloatArray, ramp: FloatArray) -> CentreLines:
-        """Return the lines of two paths, and find where they run together."""
+        """Return the lines of two paths, with the place from which they run together.
+
+        Args:
+            mainline: lane coordinate, x and y of points, (n, 3), in m.
+            ramp: the same of the ramp.
+        """
         along_m = -np.arange(0.0, LOOKED_AT_M, SPACING_M)
         places = _at(ramp, along_m)[:, None] - _at(mainline, along_m)[None]
         apart = np.linalg.norm(places, axis=2).min(axis=1) >= TOUCHING_M
@@ -51,8 +61,15 @@ class CentreLines:
 def closest_before_m(trajectories: Sequence[Trajectory], lines: CentreLines) -> list[float]:
     """Return the smallest clearance of the VUT and a car of the mainline before M, in m.
 
-    It is looked for where the lanes run together, and infinite where the VUT never came there.
-    Episodes are looked at together: most of the time of one is the calls of numpy.
+    Episodes are computed together, because most of the time of one is the calls of numpy.
+
+    Args:
+        trajectories: the motions.
+        lines: centre lines of the road.
+
+    Returns:
+        A clearance for each motion, over the steps in which the VUT is where the lanes run
+        together; infinite where it never came there.
     """
     closest_m, parts, places = [math.inf] * len(trajectories), [], []
     for place, trajectory in enumerate(trajectories):

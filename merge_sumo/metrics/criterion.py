@@ -26,7 +26,6 @@ from merge_sumo.metrics.merge import Severity
 from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.metrics.paper import margin_of
 from merge_sumo.metrics.temporal import check_formula, robustness, try_formula
-from merge_sumo.printable import nearest, printable
 from merge_sumo.scenario.scenario import VEHICLES, VUT, Scenario
 from merge_sumo.scenario.trajectory import End, Trajectory
 
@@ -94,8 +93,6 @@ class Criterion:
         """Check the condition, and write it as Python would."""
         name = self.fail_when.strip()
         if name not in CRITERIA:
-            if name.isidentifier() and (near := nearest(name, CRITERIA)):
-                raise UserError(f"`fail_when` is {printable(name)!r}: did you mean {near[0]}?")
             _, name = _parsed(self.fail_when)
         object.__setattr__(self, "fail_when", name)
         if self.require is not None:
@@ -215,7 +212,7 @@ PAPER_CRITERION = Criterion()
 def _parsed(text: str) -> tuple[Condition, str]:
     """Return a condition, which may name criteria, and its text as Python would write it."""
     named = {name: criterion.condition for name, criterion in CRITERIA.items()}
-    return parse_condition(text, vocabulary(), "`fail_when`", named)
+    return parse_condition(text, vocabulary(), named)
 
 
 def condition_of(text: str) -> Condition:

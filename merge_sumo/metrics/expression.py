@@ -1,4 +1,4 @@
-"""Conditions over named values: parsed without running anything, with a margin.
+"""Conditions over named values, parsed without running code; each has a margin.
 
 A condition has comparisons with `and`, `or`, `not` and brackets, as in Python:
 `ttc_s < 1.5 or drac_mps2 > 4 or end == "TIMEOUT"`. Its margin is the negative robustness of
@@ -31,39 +31,48 @@ MOST_CHARACTERS = 1000
 Vocabulary = Mapping[str, Set[str] | None]
 """The known values by name: the possible texts, or None for a number."""
 OTHER_SIGNS = re.compile(r"&&?|\|\|?|!(?!=)|(?<![=<>!])=(?!=)")
-"""Signs of other languages."""
+"""Operators of other languages."""
 
 
 class Condition(NamedTuple):
-    """A condition: its margin for values by name, and the names in it."""
+    """A parsed condition.
+
+    Attributes:
+        margin: returns the margin for values by name, below 0 where the condition is met.
+        names: names in the condition.
+    """
 
     margin: Callable[[Mapping[str, Value]], float]
     names: frozenset[str]
 
 
 def parse_condition(
-    text: str, vocabulary: Vocabulary, option: str, named: Mapping[str, str] | None = None
+    text: str, vocabulary: Vocabulary, named: Mapping[str, str]
 ) -> tuple[Condition, str]:
     """Return the condition of a text, and the text as Python would write it.
 
     Args:
         text: the condition as the user wrote it.
         vocabulary: the values that may be in it.
-        option: name of the option, for messages.
         named: other conditions that may be in it, by name.
 
     Raises:
         UserError: the text is not a condition.
+
+    Example:
+        >>> condition, text = parse_condition("ttc_s<1.5", {"ttc_s": None}, {})
+        >>> text, condition.margin({"ttc_s": 3.0})
+        ('ttc_s < 1.5', 1.0)
     """
     shown = printable(text[:80]) + ("..." if len(text) > 80 else "")
-    what = f"{option} {shown!r}"
+    what = f"`fail_when` {shown!r}"
     try:
-        _check_length(text, option)
+        _check_length(text)
         with warnings.catch_warnings(action="ignore"):  # "1.5or" is odd, and means what it says
             tree = ast.parse(text.lstrip(), mode="eval").body
         written = ast.unparse(tree)
-        _check_length(written, option)
-        return _Parser(vocabulary, what, named or {}).condition(tree), written
+        _check_length(written)
+        return _Parser(vocabulary, what, named).condition(tree), written
     except (SyntaxError, ValueError, MemoryError, RecursionError) as error:
         sign = OTHER_SIGNS.search(text)
         hint = f": write and, or, not, == or < instead of {sign[0]}" if sign else ""
@@ -73,10 +82,9 @@ def parse_condition(
         ) from error
 
 
-def _check_length(text: str, option: str) -> None:
+def _check_length(text: str) -> None:
     if len(text) > MOST_CHARACTERS:
-        most = f"{MOST_CHARACTERS} are the most"
-        raise UserError(f"{option} has {len(text)} characters: {most}")
+        raise UserError(f"`fail_when` has {len(text)} characters: {MOST_CHARACTERS} are the most")
 
 
 class _Parser:
@@ -84,7 +92,11 @@ class _Parser:
         self._vocabulary, self._what, self._named = vocabulary, what, named
 
     def condition(self, node: ast.expr) -> Condition:
-        """Return the condition of a part of the tree."""
+        """Return the condition of a part of the tree.
+
+        Args:
+            node: the part.
+        """
         match node:
             case ast.BoolOp(op=sign, values=parts):
                 return _joined(list(map(self.condition, parts)), every=isinstance(sign, ast.And))
@@ -170,7 +182,7 @@ class _Parser:
 
 
 def _inequality(left: str | float, right: str | float, *, or_equal: bool) -> Condition:
-    """Return whether one side is below the other, or as large where `or_equal`."""
+    """Return the condition that one side is below the other, or equal where `or_equal`."""
     unit, names = 1.0, set[str]()
     for side in (left, right):
         if isinstance(side, str):
@@ -194,7 +206,7 @@ def _negated(condition: Condition) -> Condition:
 
 
 def _joined(parts: Sequence[Condition], *, every: bool) -> Condition:
-    """Return whether every one of some conditions is met, or any."""
+    """Return the condition that every one of some conditions is met, or any."""
     worst = max if every else min
     names = frozenset[str]().union(*(part.names for part in parts))
     return Condition(lambda values: worst(part.margin(values) for part in parts), names)

@@ -30,7 +30,6 @@ from merge_sumo.metrics.merge import (
     STANDS_MPS,
     Severity,
     brake_after_mps2,
-    braked_after_mps2,
     closest_after_m,
     gaps_m,
     last_avoidable_s,
@@ -467,7 +466,13 @@ class Measures:
         It is of cars behind the VUT, and of the VUT where the nearest car is ahead; None without a
         merge.
         """
-        return braked_after_mps2(self.trajectory)
+        after = self.trajectory.after
+        if after is None:
+            return None
+        x_m = after[0, :, 0]
+        brakes = x_m < x_m[VUT]
+        brakes[VUT] = x_m[self.trajectory.nearest] > x_m[VUT]
+        return max(0.0, -float(after[:, brakes, 2].min(initial=0.0)))
 
     def _after(self) -> tuple[FloatArray, FloatArray]:
         """Return bumper gaps and closing speeds in the follow-up, (T, A - 1) each."""

@@ -21,12 +21,10 @@ from merge_sumo.scenario.scenario import DT_S, VUT, Scenario
 from merge_sumo.scenario.trajectory import End, Trajectory
 
 REACTION_S = 0.75
-"""tau: from seeing the danger to braking, as the competent and careful driver of UN Regulation
-No. 157 takes (`drivers/reference.py`)."""
-
-
+"""tau, from seeing the danger to braking, of the competent and careful driver of UN Regulation No.
+157 (`drivers/reference.py`)."""
 STANDS_MPS = 0.1
-"""A slower VUT stands."""
+"""Speed below which a VUT stands."""
 HARSH_MPS2 = 3.0
 """The most that a lane change may ask of a vehicle that approaches from behind: UN Regulation
 No. 79, 5.6.4.7."""
@@ -49,7 +47,11 @@ class Neighbour(NamedTuple):
 
 
 def neighbours(trajectory: Trajectory) -> list[Neighbour]:
-    """Return the cars of the mainline at M; none where the VUT did not merge."""
+    """Return the cars of the mainline at M; none where the VUT did not merge.
+
+    Args:
+        trajectory: the motion.
+    """
     if trajectory.end is not End.MERGED:
         return []
     scenario, last = trajectory.case.scenario, trajectory.motion[-1]
@@ -64,7 +66,11 @@ def neighbours(trajectory: Trajectory) -> list[Neighbour]:
 
 
 def place_of_merge_m(trajectory: Trajectory) -> float:
-    """Return where the VUT merges: at M, or where it left the acceleration lane."""
+    """Return the place where the VUT merges, in m: M, or where it left the acceleration lane.
+
+    Args:
+        trajectory: the motion.
+    """
     on_road = trajectory.case.scenario.lane_m is not None
     return float(trajectory.x_vut_m[-1]) if on_road else 0.0
 
@@ -73,6 +79,9 @@ def merged_rows(trajectory: Trajectory) -> NDArray[np.bool_]:
     """Return the rows, (T + 1,), of the whole motion in which the VUT has left its lane.
 
     There are none without an acceleration lane: ramp and mainline have the same lanes after M.
+
+    Args:
+        trajectory: the motion.
     """
     merged = np.zeros(len(trajectory.whole), dtype=np.bool_)
     leaves = trajectory.case.scenario.lane_m is not None and trajectory.end is End.MERGED
@@ -81,10 +90,14 @@ def merged_rows(trajectory: Trajectory) -> NDArray[np.bool_]:
 
 
 def brake_after_mps2(trajectory: Trajectory) -> float:
-    """Return the deceleration, in m/s2, that a car needs after the merge.
+    """Return the largest deceleration, in m/s2, that a car or the VUT needs after the merge.
 
-    0 where no car has to brake or the VUT never merged, infinite where bodies overlap or no braking
-    is in time. In traffic it is the largest that any car or the VUT needs.
+    Args:
+        trajectory: the motion.
+
+    Returns:
+        0 where no vehicle has to brake or the VUT never merged; infinite where bodies overlap or no
+        braking is in time.
     """
     needed_mps2 = [0.0]
     for car in neighbours(trajectory):
@@ -98,8 +111,11 @@ def brake_after_mps2(trajectory: Trajectory) -> float:
 def closest_after_m(trajectory: Trajectory) -> tuple[float, float | None]:
     """Return the smallest clearance from M on, in m, and the speed of the first contact, in m/s.
 
-    Both are of the motion: at M, and in the follow-up where the scenario has one. The clearance is
-    infinite without a merge, the speed None without a contact.
+    Args:
+        trajectory: the motion; without a follow-up it ends at M.
+
+    Returns:
+        The clearance is infinite without a merge, the speed None without a contact.
     """
     if trajectory.end is not End.MERGED:
         return math.inf, None
@@ -112,23 +128,18 @@ def closest_after_m(trajectory: Trajectory) -> tuple[float, float | None]:
     return float(gap_m.min()), float(np.abs(closing_mps[touching[0, 0]][first]).max())
 
 
-def braked_after_mps2(trajectory: Trajectory) -> float | None:
-    """Return the hardest braking after M, in m/s2; None without a follow-up.
-
-    It is of the cars behind the VUT at M, and of the VUT where the nearest car is ahead of it.
-    """
-    if trajectory.after is None:
-        return None
-    x_m = trajectory.after[0, :, 0]
-    is_behind = x_m < x_m[VUT]
-    is_behind[VUT] = x_m[trajectory.nearest] > x_m[VUT]
-    return max(0.0, -float(trajectory.after[:, is_behind, 2].min(initial=0.0)))
-
-
 def gaps_m(after: FloatArray, lengths_m: tuple[float, float]) -> tuple[FloatArray, FloatArray]:
-    """Return the bumper gaps and closing speeds, (T, A - 1), of x and v in one lane, (T, A, 2)."""
-    cars, vut = np.delete(after, VUT, axis=1), after[:, [VUT]]
-    dx, dv = ((cars - vut)[:, :, column] for column in (0, 1))
+    """Return the bumper gaps and closing speeds of the VUT and each other car in one lane.
+
+    Args:
+        after: x and v of all vehicles, (T, A, 2) or more columns, in m and m/s.
+        lengths_m: lengths of a car of the mainline and of the VUT.
+
+    Returns:
+        Gaps, negative where bodies overlap, and speeds, negative where gaps open: (T, A - 1) each.
+    """
+    apart = np.delete(after, VUT, axis=1) - after[:, [VUT]]
+    dx, dv = apart[:, :, 0], apart[:, :, 1]
     length_m = np.where(dx >= 0.0, *lengths_m)
     return np.abs(dx) - length_m, np.where(dx >= 0.0, -dv, dv)
 
@@ -143,7 +154,11 @@ class Severity(StrEnum):
 
 
 def meanings(scenario: Scenario) -> dict[Severity, str]:
-    """Return the meaning of each severity in a scenario."""
+    """Return the meaning of each severity in a scenario.
+
+    Args:
+        scenario: the scenario.
+    """
     soon = f"within {scenario.follow_up_s:g} s after"
     found = {
         Severity.CONTACT: f"bodies touch at M or {soon} it",
@@ -158,16 +173,31 @@ def meanings(scenario: Scenario) -> dict[Severity, str]:
 
 
 def check_from(from_s: float | None) -> None:
-    """Raise `UserError` where `from_s` is neither None nor a finite number that is not above 0."""
+    """Check the time from which a case is shown.
+
+    Args:
+        from_s: the time before the first conflict, in s.
+
+    Raises:
+        UserError: it is neither None nor a finite number of 0 or below.
+    """
     if from_s is not None and not (isinstance(from_s, int | float) and -1e300 <= from_s <= 0.0):
         raise UserError(f"`from_s` is {from_s!r:.40}: give a number not above 0, such as -3")
 
 
 class Conflict(NamedTuple):
-    """The row of the first conflict of an episode, and its kind in words.
+    """The first conflict of an episode.
 
     With the VUT in the lane of the mainline it is the contact, where bodies first overlap, else the
     lowest time to collision between bumpers, else the merge. Without a merge it is the end.
+
+    Attributes:
+        row: row of the whole motion.
+        what: its kind in words, such as "the contact".
+
+    Example:
+        >>> Conflict.of(trajectory)
+        Conflict(row=81, what='the contact')
     """
 
     row: int
@@ -175,12 +205,12 @@ class Conflict(NamedTuple):
 
     @classmethod
     def find(cls, motion: FloatArray, merges: int | None, lengths_m: tuple[float, float]) -> Self:
-        """Find it in x and v, (T + 1, A, 2), with a VUT in that lane from a row on, or never.
+        """Return the first conflict of a motion.
 
         Args:
             motion: x and v of all vehicles, (T + 1, A, 2), m and m/s.
             merges: first row in which the VUT is on the mainline; None for never.
-            lengths_m: lengths of the VUT and of the other cars.
+            lengths_m: lengths of a car of the mainline and of the VUT.
         """
         if merges is None:
             return cls(len(motion) - 1, "the end of the episode")
@@ -193,17 +223,21 @@ class Conflict(NamedTuple):
 
     @classmethod
     def of(cls, trajectory: Trajectory) -> Self:
-        """Find it in the motion of an episode."""
+        """Return the first conflict of an episode.
+
+        Args:
+            trajectory: the motion.
+        """
         scenario = trajectory.case.scenario
         merges = len(trajectory.motion) - 1 if trajectory.end is End.MERGED else None
         in_one_lane = scenario.ramp == scenario.mainline
         return cls.find(trajectory.whole, 0 if in_one_lane else merges, scenario.lengths_m)
 
     def begin(self, from_s: float | None) -> tuple[int, list[str]]:
-        """Return the row some time before it, and a line that says so.
+        """Return the row some time before the conflict, and lines that say so.
 
         Args:
-            from_s: time, not above 0; None for the first row, without a line.
+            from_s: time in s, not above 0; None for the first row, without a line.
         """
         if from_s is None:
             return 0, []
@@ -217,12 +251,14 @@ def last_avoidable_s(trajectory: Trajectory) -> float | None:
 
     The POV never moves backwards, so of all ways to arrive at M the first and the last possible
     decide: the VUT passes in front at full acceleration, or waits at full braking. Both are
-    rolled out from every step of the record at once. On an acceleration lane it is about the place
-    where the VUT merged. In traffic every car has to be avoided, and
-    gaps between cars are left out.
+    simulated from every step of the record at once. On an acceleration lane M is the place where
+    the VUT merged. In traffic the VUT has to avoid every car, and does not use gaps between cars.
 
-    Other cars move as recorded, then keep their last speed. The VUT moves by eq. (4): by the speed
-    before a step, so that a decision moves it from the next step on.
+    Other cars move as recorded, then keep their last speed. The VUT moves by eq. (4), x += v dt and
+    v += a dt with v >= 0, so that a decision moves it from the next step on.
+
+    Args:
+        trajectory: the motion.
     """
     place_m = place_of_merge_m(trajectory)
     cars, scenario = np.delete(trajectory.motion, VUT, axis=1), trajectory.case.scenario

@@ -25,7 +25,7 @@ _DIGITS = 4
 """Decimals of a prediction, in memory as on disk: a resumed campaign decides by the same values."""
 
 
-Chance = Annotated[float, Meta(ge=0.0, le=1.0)]
+Probability = Annotated[float, Meta(ge=0.0, le=1.0)]
 
 
 class Prediction(Record, frozen=True):
@@ -40,9 +40,9 @@ class Prediction(Record, frozen=True):
     """
 
     dx_m: tuple[tuple[float | None, ...], ...]
-    p_twin: Chance
-    p_surrogate: Chance
-    p_fail: Chance
+    p_twin: Probability
+    p_surrogate: Probability
+    p_fail: Probability
 
     @classmethod
     def of(cls, dx_m: FloatArray, p_twin: float, p_surrogate: float, p_fail: float) -> Self:
@@ -57,8 +57,8 @@ class Prediction(Record, frozen=True):
         gaps = []
         for row in np.round(dx_m, _DIGITS).tolist():
             gaps.append(tuple(None if math.isnan(gap) else gap for gap in row))
-        chances = (round(float(p), _DIGITS) for p in (p_twin, p_surrogate, p_fail))
-        return cls(tuple(gaps), *chances)
+        probabilities = (round(float(p), _DIGITS) for p in (p_twin, p_surrogate, p_fail))
+        return cls(tuple(gaps), *probabilities)
 
     @property
     def gaps_m(self) -> FloatArray:
@@ -66,10 +66,10 @@ class Prediction(Record, frozen=True):
         return np.array(self.dx_m, dtype=np.float64)
 
     def __post_init__(self) -> None:
-        """Check that every member has the same number of gaps.
+        """Check that every row has the same number of gaps.
 
         Raises:
-            UserError: a member has none, or another number than the first.
+            UserError: a row has none, or another number than the first.
         """
         counts = {len(row) for row in self.dx_m}
         if len(counts) != 1 or 0 in counts:
@@ -176,7 +176,11 @@ class Outcome:
 
 @lru_cache
 def record_of(scenario: Scenario) -> Any:
-    """Return the type of the lines of `outcomes.jsonl` in a scenario."""
+    """Return the type of the lines of `outcomes.jsonl` in a scenario.
+
+    Args:
+        scenario: the scenario.
+    """
     types = {"index": int, "batch": int, **get_type_hints(Case)}
     required = [(name, types[name]) for name in ("index", "batch", "level", *scenario.case_fields)]
     optional: list[tuple[str, Any, Any]] = []

@@ -13,9 +13,9 @@ from merge_sumo.scenario.scenario import DT_S
 
 KMH_PER_MPS = 3.6
 CLIPPED_SHARE = 0.01
-"""Share of the steps from which on it is said that accelerations were clipped."""
+"""Share of clipped steps above which a note says so."""
 MOSTLY_CLIPPED = 0.5
-"""Share of the steps above which it is a headline: the limits drove, and not the VUT."""
+"""Share of clipped steps above which a headline says so: the limits drove, and not the VUT."""
 _THRESHOLD = re.compile(r"(\w+)\s*(?:<=?|>=?)\s*(-?\d+(?:\.\d+)?(?:e[-+]?\d+)?)(?![\w.])")
 """A measure, and the number that it is compared with."""
 
@@ -27,7 +27,7 @@ def doubts(outcomes: Sequence[Outcome], criterion: Criterion, vain: Mapping[str,
         outcomes: outcomes of a campaign.
         criterion: its failure criterion. Where all cases have the same verdict, a threshold in
             another unit or of the other sign is suggested if it would tell cases apart.
-        vain: number of cases by command that had no effect.
+        vain: number of cases by command without an effect.
     """
     clipped = _clipped(outcomes, CLIPPED_SHARE)
     often = [] if clipped is None or mostly_clipped(outcomes) else [clipped]
@@ -35,7 +35,11 @@ def doubts(outcomes: Sequence[Outcome], criterion: Criterion, vain: Mapping[str,
 
 
 def late_errors(outcomes: Sequence[Outcome]) -> Iterator[str]:
-    """Yield a sentence on cases with an error after M, which have a verdict."""
+    """Yield a sentence on cases with an error after M, if there are any; they have a verdict.
+
+    Args:
+        outcomes: outcomes of a campaign.
+    """
     wrong = [o for o in outcomes if o.is_tested and o.measures.error is not None]
     if wrong:
         first = f"the first in case {wrong[0].index}: {message_of(wrong[0])}"
@@ -43,13 +47,21 @@ def late_errors(outcomes: Sequence[Outcome]) -> Iterator[str]:
 
 
 def in_vain(cases: Mapping[str, int]) -> list[str]:
-    """Return a sentence on commands without an effect, by the number of cases with each."""
+    """Return a sentence on commands without an effect, or no sentence.
+
+    Args:
+        cases: number of cases by command.
+    """
     listed = ", ".join(f"{printable(name)} in {counted(n, 'case')}" for name, n in cases.items())
     return [f"commanded in vain, because it changes nothing here: {listed}"] if cases else []
 
 
 def mostly_clipped(outcomes: Sequence[Outcome]) -> str | None:
-    """Return a sentence on a VUT that drove at its limits in most steps; None for others."""
+    """Return a sentence on a VUT that drove at its limits in most steps; None for others.
+
+    Args:
+        outcomes: outcomes of a campaign.
+    """
     clipped = _clipped(outcomes, MOSTLY_CLIPPED)
     return clipped and f"not driven as asked: {clipped}; check the unit and the sign of its answers"
 
@@ -68,7 +80,7 @@ def _clipped(outcomes: Sequence[Outcome], share: float) -> str | None:
 
 
 def _one_verdict(outcomes: Sequence[Outcome], criterion: Criterion) -> Iterator[str]:
-    """Yield a neighbour of a criterion that tells cases apart, where itself does not."""
+    """Yield a similar criterion that tells cases apart, where the criterion does not."""
     judged = [outcome for outcome in outcomes if outcome.margin is not None]
     failures = sum(outcome.failed for outcome in judged)
     is_own = criterion.require is None and criterion.fail_when not in CRITERIA

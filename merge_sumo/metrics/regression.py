@@ -19,34 +19,38 @@ FARTHEST = NO_GAP - 1.0
 
 
 def regression(new: Outcome, old: Outcome, prediction: Prediction | None = None) -> Outcome:
-    """Return the outcome of a case whose failure is a regression, with its prediction.
+    """Return the outcome of a case whose failure is a regression.
 
-    It has the measures of the new version, and its margin is not that of the score. Without a
-    verdict on both versions it has none.
+    It has the measures of the new version, and the margin of a regression; without a verdict on
+    both versions it has no margin.
 
     Args:
         new: outcome of the new version.
         old: outcome of the earlier version.
         prediction: prediction of the case.
     """
-    silent = next((outcome for outcome in (new, old) if outcome.margin is None), None)
-    if silent is not None:
-        return replace(new, measures=silent.measures, margin=None, prediction=prediction)
+    for outcome in (new, old):
+        if outcome.margin is None:
+            return replace(new, measures=outcome.measures, margin=None, prediction=prediction)
     margin = max(_margin(new), -_margin(old))
     return replace(new, margin=min(margin, FARTHEST), prediction=prediction)
 
 
 def _margin(outcome: Outcome) -> float:
-    """Return the margin of an outcome with a verdict; that of the score says less than the gap."""
+    """Return the margin of an outcome, by its gap and not by its score, which says less."""
     if outcome.margin is not None and not outcome.is_by_score:
         return outcome.margin
     return float(margins(np.array([outcome.signed_gap], dtype=np.float64))[0])
 
 
 def margins(gap: FloatArray) -> FloatArray:
-    """Return the margins, (...), that signed gaps at M stand for, in units of the limit.
+    """Return the margins that signed gaps at M stand for: the inverse of `Outcome.signed_gap`.
 
-    The inverse of `Outcome.signed_gap`; NaN is the gap of a VUT that never arrives.
+    Args:
+        gap: signed gaps in units of the limit, of any shape; NaN for a VUT that never arrives.
+
+    Returns:
+        Margins of the same shape, at most `FARTHEST`.
     """
     share = np.abs(gap)
     with np.errstate(divide="ignore"):
@@ -55,10 +59,14 @@ def margins(gap: FloatArray) -> FloatArray:
 
 
 def regression_gaps(new: FloatArray, old: FloatArray) -> FloatArray:
-    """Return the signed gap of a regression, (...), from the signed gaps of both versions.
+    """Return the signed gaps of regressions, `Outcome.signed_gap` of `regression`, as an array.
 
-    It is `Outcome.signed_gap` of `regression`: within 1 for a regression, with the sign of the new
-    version's gap.
+    Args:
+        new: signed gaps of the new version, in units of the limit; NaN where it never arrives.
+        old: those of the earlier version, of the same shape.
+
+    Returns:
+        Gaps of the same shape: within -1 to 1 for a regression, with the sign of the new gap.
     """
     margin = np.minimum(np.maximum(margins(new), -margins(old)), FARTHEST)
     size = np.where(margin >= 0.0, 1.0 + margin, 1.0 / (1.0 - np.minimum(margin, 0.0)))

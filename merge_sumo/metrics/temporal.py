@@ -19,22 +19,46 @@ from merge_sumo.errors import UserError
 from merge_sumo.metrics.expression import LEAST_MARGIN, MOST_CHARACTERS, MOST_MARGIN
 from merge_sumo.printable import meant, printable
 from merge_sumo.scenario.case import FloatArray
-from merge_sumo.scenario.scenario import DT_S, MAX_EPISODE_S, MAX_FOLLOW_UP_S
+from merge_sumo.scenario.scenario import DT_S, MAX_EPISODE_S, MAX_FOLLOW_UP_S, VUT
 from merge_sumo.scenario.trajectory import Trajectory
 
 SIGNALS = (
-    *("x_pov_m", "v_pov_mps", "a_pov_mps2", "x_vut_m", "v_vut_mps", "a_vut_mps2"),
-    *("dx_m", "dv_mps", "bumper_gap_m", "ttc_s"),
+    "x_pov_m",
+    "v_pov_mps",
+    "a_pov_mps2",
+    "x_vut_m",
+    "v_vut_mps",
+    "a_vut_mps2",
+    "dx_m",
+    "dv_mps",
+    "bumper_gap_m",
+    "ttc_s",
 )
 """Signals of a formula, at every step; of the car that is nearest to the VUT at M."""
 NEVER_S = 100.0
-"""The longest time to collision, also where no gap closes."""
+"""Time to collision where no gap closes, and the longest one."""
 LAST_PYTHON = (3, 12)
 """The last one that the parser of rtamt runs on."""
 WORDS = (
-    *("always", "eventually", "until", "historically", "once", "since", "not", "and", "or"),
-    *("implies", "iff", "xor", "rise", "fall", "prev", "next", "abs"),
+    "always",
+    "eventually",
+    "until",
+    "historically",
+    "once",
+    "since",
+    "not",
+    "and",
+    "or",
+    "implies",
+    "iff",
+    "xor",
+    "rise",
+    "fall",
+    "prev",
+    "next",
+    "abs",
 )
+"""Operators of formulas."""
 FINITE = ("Addition", "Subtraction", "Multiplication", "Abs", "Constant", "Predicate")
 """Parts of a formula with numbers, by rtamt's names: infinite ones would decide by chance."""
 _TOKEN = re.compile(r"\s+|[A-Za-z_]\w*|(?:\d+\.?\d*|\.\d+)(?!\w)|<=|>=|->|[-+*<>()\[\]:,]")
@@ -45,6 +69,9 @@ _NUMBER = re.compile(r"\d+\.?\d*|\.\d+")
 
 def check_formula(text: str) -> str:
     """Return a formula on one line, with single spaces; `try_formula` parses it.
+
+    Args:
+        text: the formula as the user wrote it.
 
     Raises:
         UserError: it has an unknown word or sign, or a time that no episode has.
@@ -73,7 +100,14 @@ def check_formula(text: str) -> str:
 
 
 def try_formula(text: str) -> None:
-    """Raise `UserError` where a checked formula cannot be parsed, or rtamt is missing."""
+    """Check that rtamt can evaluate a formula.
+
+    Args:
+        text: a checked formula.
+
+    Raises:
+        UserError: it cannot be parsed, or rtamt is missing.
+    """
     try:
         _robustness(text, {name: np.ones(2) for name in SIGNALS})
     except ImportError as error:
@@ -85,7 +119,7 @@ def try_formula(text: str) -> None:
         raise UserError(f"`require` needs rtamt: {how}") from error
     except UserError:
         raise
-    # A parser that is not ours.
+    # The parser of rtamt raises errors of many types.
     except Exception as error:
         raise UserError(
             f"`require` {text[:80]!r} is not a formula of signal temporal logic such as 'always "
@@ -94,12 +128,15 @@ def try_formula(text: str) -> None:
 
 
 def signals(trajectory: Trajectory) -> dict[str, FloatArray]:
-    """Return the signals of an episode by name, (T + 1,), with those of the follow-up after M."""
+    """Return the signals of an episode by name, (T + 1,) each, with the follow-up after M.
+
+    Args:
+        trajectory: the motion.
+    """
     motion = trajectory.whole
     scenario = trajectory.case.scenario
-    (x_pov, v_pov, a_pov), (x_vut, v_vut, a_vut) = (
-        motion[:, row].T for row in (trajectory.nearest, 1)
-    )
+    x_pov, v_pov, a_pov = motion[:, trajectory.nearest].T
+    x_vut, v_vut, a_vut = motion[:, VUT].T
     dx, dv = x_pov - x_vut, v_pov - v_vut
     gap = np.abs(dx) - np.where(dx >= 0.0, scenario.pov_length_m, scenario.vut_length_m)
     closing = np.where(dx >= 0.0, -dv, dv)
@@ -110,16 +147,22 @@ def signals(trajectory: Trajectory) -> dict[str, FloatArray]:
 
 
 def robustness(text: str, trajectory: Trajectory) -> float:
-    """Return the robustness of a formula at the begin of an episode: finite, and never 0."""
+    """Return the robustness of a formula at the begin of an episode: finite, and never 0.
+
+    Args:
+        text: a checked formula.
+        trajectory: the motion.
+    """
     value = _robustness(text, signals(trajectory))
     size = min(max(abs(value), LEAST_MARGIN), MOST_MARGIN)
     return size if value > 0.0 else -size
 
 
 def _robustness(text: str, values: dict[str, FloatArray]) -> float:
-    steps = len(values[SIGNALS[0]])
-    time_s = [round(step * DT_S, 1) for step in range(steps)]
-    data = {"time": time_s, **{name: of.tolist() for name, of in values.items()}}
+    steps = len(values["x_pov_m"])
+    data = {"time": [round(step * DT_S, 1) for step in range(steps)]}
+    for name, signal in values.items():
+        data[name] = signal.tolist()
     specification = _specification(text)
     value = float(specification.evaluate(data)[0][1])
     # A minimum or a maximum over time hides infinite values: every part is checked, without the
@@ -128,8 +171,8 @@ def _robustness(text: str, values: dict[str, FloatArray]) -> float:
         if type(node).__name__ in FINITE and not all(map(math.isfinite, part[:steps])):
             raise UserError(
                 f"`require` {printable(text[:80])!r} calculates with infinity: prev and next are "
-                "infinite where no step is, so put them around a comparison, not into it; and "
-                "write no number that large"
+                "infinite outside of the episode, so put them around a comparison, not into it; "
+                "and write no number that large"
             )
     return value
 
@@ -142,6 +185,6 @@ def _specification(text: str) -> Any:
     for name in SIGNALS:
         specification.declare_var(name, "float")
     specification.set_sampling_period(100, "ms", 0.1)
-    specification.spec = f"({text})"  # what stands behind a formula would not be read
+    specification.spec = f"({text})"  # text after a formula would not be read
     specification.parse()
     return specification

@@ -44,7 +44,7 @@ CONDITIONS = st.recursive(
 
 def margin(text, **values):
     """Return the margin of a condition over the values x, y and who."""
-    condition, _ = parse_condition(text, WORDS, "`fail_when`")
+    condition, _ = parse_condition(text, WORDS, {})
     return condition.margin({"x": 0.0, "y": 0.0, "who": "A", **values})
 
 
