@@ -198,8 +198,10 @@ class ModelRollout:
         after[:, :, 0] += DT_S * np.arange(steps + 1)[:, None] * at_m[:, 1]
         return after if steps else None
 
-    def _starts(self, level: int, points: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return states (x, v, a), (3, A, n), and psi, (n,), of cases of the unit cube, (n, d)."""
+    def _starts(
+        self, level: int, points: FloatArray
+    ) -> tuple[FloatArray, FloatArray, NDArray[np.int64]]:
+        """Return states (x, v, a), (3, A, n), psi and level, (n,), of cases, (n, d)."""
         scenario = self.scenario
         values = {}
         for dimension, units in zip(scenario.dimensions(level), points.T, strict=True):
@@ -214,7 +216,7 @@ class ModelRollout:
             v_mps[[AHEAD, BEHIND]] = v_mps[POV]
             x_m[AHEAD] = x_m[POV] + values["headway_ahead_s"] * v_mps[POV]
             x_m[BEHIND] = x_m[POV] - values["headway_behind_s"] * v_mps[POV]
-        return states, values.get("svo_rad", np.zeros(n))
+        return states, values.get("svo_rad", np.zeros(n)), np.full(n, level)
 
     def _play(
         self,
@@ -234,15 +236,14 @@ class ModelRollout:
             Gaps at M in m, (R,), NaN where the VUT never arrives, and last steps, (R,).
         """
         scenario = self.scenario
-        starts = [self._starts(level, of_level) for level, of_level in points.items()]
-        states, svo_rad = (np.concatenate(part, axis=-1) for part in zip(*starts, strict=True))
-        levels = np.repeat(list(points), [len(of_level) for of_level in points.values()])
-        cases = len(levels)
-        states, svo_rad = np.tile(states, len(drives)), np.tile(svo_rad, len(drives))
+        starts = []
+        for level, of_level in points.items():
+            starts.append(self._starts(level, of_level))
+        parts = [np.concatenate(part, axis=-1) for part in zip(*starts, strict=True)]
+        states, svo_rad, levels = (np.tile(part, len(drives)) for part in parts)
         x_m, v_mps, a_mps2 = states
-        levels = np.tile(levels, len(drives))
         rows = np.arange(len(levels))
-        bounds = np.arange(0, len(rows) + 1, cases)
+        bounds = np.arange(len(drives) + 1) * (len(rows) // len(drives))
         gap_m = np.full(len(rows), np.nan)
         last = np.full(len(rows), scenario.max_steps)
         cars = np.flatnonzero(np.arange(len(x_m)) != VUT)
