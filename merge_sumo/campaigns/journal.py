@@ -39,7 +39,7 @@ from merge_sumo.files import (
 )
 from merge_sumo.metrics.outcome import Episode, Outcome
 from merge_sumo.records import to_json
-from merge_sumo.scenario.signals import to_record
+from merge_sumo.scenario.signals import to_runs
 
 
 def to_line(outcome: Outcome) -> str:
@@ -184,7 +184,7 @@ def _arrays(group: Sequence[Episode]) -> bytes:
         rows.append(len(trajectory.whole))
         motions.append(trajectory.whole.reshape(len(trajectory.whole), -1))
         if trajectory.signals:
-            signals[str(index)] = to_record(trajectory.signals)
+            signals[str(index)] = to_runs(trajectory.signals)
     arrays: dict[str, Any] = {}
     if signals:
         arrays["signals"] = np.frombuffer(json.dumps(signals, allow_nan=False).encode(), np.uint8)

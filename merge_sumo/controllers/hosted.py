@@ -21,7 +21,7 @@ from merge_sumo.controllers.spec import ControllerKind, ControllerOptions, Contr
 from merge_sumo.drivers.base import ControllerDiedError, Driver, Scene
 from merge_sumo.errors import ControllerError, UserError
 from merge_sumo.scenario.case import FloatArray
-from merge_sumo.scenario.signals import StepSignals, as_signals
+from merge_sumo.scenario.signals import StepSignals, valid_signals
 
 SUPPORTED = os.name == "posix"
 """Elsewhere a controller runs in this process."""
@@ -273,7 +273,7 @@ class HostedDriver(ControllerDriver):
         # The process may send any text: it is bounded again.
         signals: dict[int, StepSignals] = {}
         for corridor, left in self._reply.signals.items():
-            signals[corridor] = as_signals(left)
+            signals[corridor] = valid_signals(left)
         return signals
 
     def parameters(self) -> Mapping[str, float]:

@@ -43,7 +43,7 @@ from merge_sumo.files import check_code
 from merge_sumo.registry import entries_of
 from merge_sumo.scenario.case import FloatArray
 from merge_sumo.scenario.scenario import DT_S, VUT
-from merge_sumo.scenario.signals import StepSignals, as_signals
+from merge_sumo.scenario.signals import StepSignals, valid_signals
 
 objects: dict[str, Any] = {}
 """Objects of this process that are controllers, by the arguments of their specs."""
@@ -290,7 +290,7 @@ class PythonController(Controller):
     def signals(self) -> StepSignals:
         """Return the signals that the object has left in its attribute `signals`."""
         left = getattr(self._thing, "signals", None)
-        return {} if left is None else as_signals(left)
+        return {} if left is None else valid_signals(left)
 
     def parameters(self) -> Mapping[str, float]:
         """Return the parameters of the object."""

@@ -92,7 +92,7 @@ class SensedDriver(DriverWrapper):
         """Take the sensors of a case; the driver begins with the start that they show."""
         self._sensors[corridor] = sensors = _Sensors(case)
         shown = ObservedCase(
-            told=tuple(map(tuple, sensors.shown(sensors.start).T.tolist())),
+            observed=tuple(map(tuple, sensors.shown(sensors.start).T.tolist())),
             level=case.level,
             svo_rad=case.svo_rad,
             v_vut0_mps=case.v_vut0_mps,

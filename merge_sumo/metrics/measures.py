@@ -252,7 +252,7 @@ class Measures:
 
     def _at_end(self, column: int) -> float | None:
         """Return the difference of the car at M and the VUT."""
-        if not self.end.is_tested:
+        if self.end is not End.MERGED:
             return None
         last = self.trajectory.motion[-1]
         return float(last[self.trajectory.nearest, column] - last[VUT, column])
@@ -269,7 +269,7 @@ class Measures:
 
         A POV that has not arrived by t1 keeps its speed at t1; None when it stands.
         """
-        return _post_encroachment_time(self.trajectory) if self.end.is_tested else None
+        return _post_encroachment_time(self.trajectory) if self.end is End.MERGED else None
 
     @measure(column="time", missing=0.0)
     def t_end_s(self) -> float:
@@ -282,7 +282,7 @@ class Measures:
 
         None where the VUT never reached M, and after an error.
         """
-        if not self.end.is_tested:
+        if self.end is not End.MERGED:
             return None
         if self.clearance_m is not None and self.clearance_m <= 0.0:
             return Severity.CONTACT

@@ -17,7 +17,7 @@ from merge_sumo.metrics.paper import margin_of
 from merge_sumo.records import Record, convert, decode, record_type, to_plain
 from merge_sumo.scenario.case import Case, FloatArray
 from merge_sumo.scenario.scenario import Scenario
-from merge_sumo.scenario.trajectory import Trajectory
+from merge_sumo.scenario.trajectory import End, Trajectory
 
 NO_GAP = 100.0 / 3.0
 """Gap of a VUT that never arrives, in units of the limit: another car goes first, far away."""
@@ -119,7 +119,7 @@ class Outcome:
     @property
     def is_tested(self) -> bool:
         """Whether the VUT reached the merge point or failed; other cases are not judged."""
-        return self.measures.end.is_tested or self.failed
+        return self.measures.end is End.MERGED or self.failed
 
     @property
     def passes(self) -> bool:

@@ -69,7 +69,7 @@ def merge_score(trajectory: Trajectory) -> float | None:
         return None
     scenario = trajectory.case.scenario
     crash = p_safety = 0.0
-    if trajectory.end.is_tested:
+    if trajectory.end is End.MERGED:
         pov, vut = trajectory.motion[-1, [trajectory.nearest, VUT], :2].tolist()
         dx_m = pov[0] - vut[0]
         ttc_s = time_to_collision(dx_m, pov[1] - vut[1])

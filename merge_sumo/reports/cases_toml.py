@@ -34,6 +34,7 @@ from merge_sumo.records import check_toml_size, toml_value
 from merge_sumo.road.scenario_file import SUFFIX
 from merge_sumo.scenario.case import to_unit
 from merge_sumo.scenario.scenario import Scenario
+from merge_sumo.scenario.trajectory import End
 
 MOST = 40
 """Cases of a file where the user names none."""
@@ -186,7 +187,7 @@ def _scenario(scenario: Scenario, path: Path) -> dict[str, Any]:
 def _line(run: RecordedCampaign, outcome: Outcome) -> str:
     """Return the line of a case: verdict and deciding measures, its place, and its acceptance."""
     record = outcome.to_record() | {"margin": outcome.margin, "verdict": verdict_of(outcome)}
-    if outcome.measures.end.is_tested:
+    if outcome.measures.end is End.MERGED:
         record["end"] = None
     if isinstance(run, CasesFile) and not outcome.passes:
         record["accepted"] = run.accepted.get(outcome.index)

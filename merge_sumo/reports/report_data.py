@@ -22,7 +22,7 @@ from merge_sumo.reports.text import causes, changes, name_and_unit
 from merge_sumo.road.drawing import road_data
 from merge_sumo.scenario.case import FloatArray, to_unit
 from merge_sumo.scenario.scenario import ALL_LEVELS, DT_S, VEHICLES, level_name
-from merge_sumo.scenario.signals import to_record
+from merge_sumo.scenario.signals import to_runs
 from merge_sumo.scenario.trajectory import Trajectory
 
 SPEED_UNIT_MPS = 0.002
@@ -75,7 +75,7 @@ def page_data(model: ReportModel) -> dict[str, Any]:
         "cases": cases,
         "speeds": speeds,
         "speed_unit_mps": SPEED_UNIT_MPS,
-        "signals": {i: to_record(t.signals) for i, t in model.motion.items() if t.signals},
+        "signals": {i: to_runs(t.signals) for i, t in model.motion.items() if t.signals},
         "why": _explanations(model),
         "boxes": [{"level": box.level, "cases": box.indices} for box in model.boxes],
         "maps": {level: _map(model, level) for level in model.levels},

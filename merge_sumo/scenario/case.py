@@ -1,9 +1,7 @@
-"""A test case, and the pool that it is drawn from (Wang et al., section V-A).
+"""Test cases, and the pool from which a campaign chooses them (Wang et al., section V-A).
 
-A case is s = [x_POV0, v_POV0, psi, L]: where the POV starts, how fast, its social value
-orientation, and its level of reasoning. The orientation exists only at level 2, so the pool is
-three boxes: two-dimensional at levels 0 and 1, three-dimensional at level 2. Where a scenario has
-traffic, or a range of the VUT's speed, these are further coordinates.
+The pool has one box for each level of the POV. Its coordinates are the numbers for which a scenario
+has a range: x_POV0 and v_POV0, psi at level 2, and headways, speeds of the VUT and imperfections.
 """
 
 from __future__ import annotations
@@ -26,7 +24,6 @@ from merge_sumo.scenario.imperfection import (
     SENSE,
     Actuation,
     Sensing,
-    with_numbers,
 )
 from merge_sumo.scenario.scenario import (
     ALL_LEVELS,
@@ -46,29 +43,30 @@ _imperfections = attrgetter(*_IMPERFECT_FIELDS)
 _NONE = (None,) * len(IMPERFECTIONS)
 _PERFECT = (PERFECT_SENSING, PERFECT_ACTUATION)
 MOST_DRAWS = 2**32
-"""Draws of a case: their numbers have 4 bytes."""
+"""Maximum number of draws of a case: 4 bytes."""
 MOST_SVO_RAD = math.nextafter(SVO.high, 0.0)
+"""Largest orientation: pi/2 itself is not in the pool."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Case:
-    """One test case, a point of a scenario.
-
-    Raises `UserError` for values with which the scenario cannot be set up. Values outside the
-    pool are allowed.
+    """One test case: a start of a scenario, in the pool or outside.
 
     Attributes:
-        level: level of the POV.
-        svo_rad: its social value orientation; None below level 2.
-        x_pov0_m: where it starts.
-        v_pov0_mps: how fast.
+        level: level of reasoning of the POV; `OWN` for a POV of the user.
+        svo_rad: social value orientation of the POV; None except at level 2.
+        x_pov0_m: lane coordinate of the POV at the start.
+        v_pov0_mps: speed of the POV at the start.
         v_vut0_mps: speed of the VUT at the start.
-        headway_ahead_s: time headway of the car ahead of the POV; None without traffic.
-        headway_behind_s: that of the car behind it.
-        draw: number of the draw of random values in its episode; not a coordinate of the pool.
+        headway_ahead_s: time headway of the POV to the car ahead of it; None without traffic.
+        headway_behind_s: time headway of the car behind the POV; None without traffic.
+        sense_delay_s: number for the range `delay_s` of the `sense` of the scenario; None where it
+            is not a range. The other `sense_...` and `act_...` are alike.
+        draw: number of the draw of random values in the episode; not a coordinate of the pool.
         scenario: the scenario.
 
-    The others are numbers for ranges of the scenario's `sense` and `act`; None where it has none.
+    Raises:
+        UserError: the scenario cannot start with these values.
 
     Example:
         >>> case = Case(level=0, x_pov0_m=-250.0, v_pov0_mps=30.0, scenario=US23)
@@ -96,7 +94,7 @@ class Case:
     scenario: Scenario = field(repr=False)
 
     def __post_init__(self) -> None:
-        """Check that the numbers describe a scenario."""
+        """Check that the scenario can start with the numbers."""
         if self.level not in ALL_LEVELS:
             raise UserError(
                 f"level is {self.level}: choose 0, 1 or 2, or {OWN} for a POV of your own"
@@ -133,7 +131,7 @@ class Case:
                 )
 
     def starts(self) -> list[tuple[float, float]]:
-        """Return position and speed of every vehicle at the start, in the order of their rows."""
+        """Return position in m and speed in m/s of each vehicle, in the order of `VEHICLES`."""
         x, v = self.x_pov0_m, self.v_pov0_mps
         starts = [(x, v), (self.scenario.x_vut0_m, self.v_vut0_mps)]
         if self.headway_ahead_s is not None and self.headway_behind_s is not None:
@@ -142,42 +140,42 @@ class Case:
 
     @property
     def sensing(self) -> Sensing:
-        """How the VUT senses other cars in this case, in numbers."""
-        return with_numbers(self.scenario.sense, SENSE, self)
+        """Sensing of the VUT in this case, without ranges."""
+        return self.scenario.sense.in_case(self, SENSE)
 
     @property
     def actuation(self) -> Actuation:
-        """How it obeys its controller, in numbers."""
-        return with_numbers(self.scenario.act, ACT, self)
+        """Actuation of the VUT in this case, without ranges."""
+        return self.scenario.act.in_case(self, ACT)
 
     @property
     def start(self) -> Case:
-        """The case at its first draw."""
+        """The case with draw 0."""
         return self if self.draw == 0 else replace(self, draw=0)
 
     @property
     def seed(self) -> int:
-        """The seed of all random numbers of its episode; it follows from the case."""
+        """Seed of all random numbers of the episode, below 2**32."""
         return self._hashed((self.level, self.svo_rad, self.starts()))
 
     @property
     def controller_seed(self) -> int:
-        """The seed for a controller, which knows neither level nor orientation."""
+        """Seed for the controller, independent of the level and the orientation, unknown to it."""
         return self._hashed([(float(x), float(v)) for x, v in self.starts()])
 
     def _hashed(self, known: object) -> int:
-        """Return a number below 2**32, another one for each draw."""
+        """Return a hash below 2**32 that differs for each draw."""
         first = zlib.crc32(repr(known).encode())
         # A CRC continues from another one, and differs for different bytes of the same number.
         return first if self.draw == 0 else zlib.crc32(self.draw.to_bytes(4, "little"), first)
 
     def _check_imperfections(self) -> None:
-        """Raise `UserError` where a number is missing for a range, or there without one."""
-        given, scenario = _imperfections(self), self.scenario
-        if given == _NONE and (scenario.sense, scenario.act) == _PERFECT:
+        """Raise `UserError` where a range has no number, or a number no range."""
+        numbers, scenario = _imperfections(self), self.scenario
+        if numbers == _NONE and (scenario.sense, scenario.act) == _PERFECT:
             return
         wanted = scenario.imperfect_fields
-        for name, value in zip(_IMPERFECT_FIELDS, given, strict=True):
+        for name, value in zip(_IMPERFECT_FIELDS, numbers, strict=True):
             if (value is not None) != (name in wanted):
                 raise UserError(f"{name} belongs to a range of the scenario: give it there alone")
         if wanted:
@@ -187,46 +185,62 @@ class Case:
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class ObservedCase(Case):
-    """The part of a case that the driver of a vehicle knows: where vehicles start, and own limits.
+    """The part of a case that the driver of a vehicle knows, for `Driver.begin`.
 
-    It is not checked: a sensor may show a car anywhere.
+    Attributes:
+        observed: position in m and speed in m/s of each vehicle at the start, in the order of
+            `VEHICLES`.
     """
 
     x_pov0_m: float = math.nan
     v_pov0_mps: float = math.nan
-    told: tuple[tuple[float, float], ...]
-    """Position and speed of every vehicle at the start, in the order of their rows."""
+    observed: tuple[tuple[float, float], ...]
 
     def __post_init__(self) -> None:
-        """Accept all numbers."""
+        """Accept all numbers: a sensor may show a car anywhere."""
 
     def starts(self) -> list[tuple[float, float]]:
-        """Return position and speed of every vehicle at the start, in the order of their rows."""
-        return list(self.told)
+        """Return position in m and speed in m/s of each vehicle, in the order of `VEHICLES`."""
+        return list(self.observed)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Pool:
-    """The cases that a campaign may choose from: those of a scenario at POV levels."""
+    """The cases from which a campaign chooses.
+
+    Attributes:
+        levels: levels of the POV.
+        scenario: the scenario of all cases.
+
+    Example:
+        >>> pool = Pool(levels=(0,), scenario=US23)
+        >>> pool.cases(np.array([[0.5, 0.5]]), 0)[0].x_pov0_m
+        -260.0
+    """
 
     levels: tuple[int, ...]
     scenario: Scenario
 
     def cases(self, points: FloatArray, level: int) -> list[Case]:
-        """Return the cases at points, (n, d), of a level's unit cube."""
+        """Return the cases at points of the unit cube of a level.
+
+        Args:
+            points: coordinates between 0 and 1, (n, d).
+            level: level of the cases.
+        """
         return from_unit(points, level, scenario=self.scenario)
 
 
 def to_unit(cases: Iterable[Case], level: int, scenario: Scenario = US23) -> FloatArray:
-    """Return the cases of one level as points, (n, d), with the pool's box as the unit cube.
+    """Return cases as points of the unit cube of a level.
 
     Args:
-        cases: the cases, of one scenario.
-        level: the level of all of them.
-        scenario: gives d where there are no cases.
+        cases: cases of one scenario and of the level.
+        level: level of the cases.
+        scenario: scenario that gives d where `cases` is empty.
 
     Returns:
-        The points.
+        Coordinates, (n, d): between 0 and 1 in the pool.
     """
     cases = list(cases)
     dims = (cases[0].scenario if cases else scenario).dimensions(level)
@@ -237,12 +251,12 @@ def to_unit(cases: Iterable[Case], level: int, scenario: Scenario = US23) -> Flo
 
 
 def from_unit(points: FloatArray, level: int, *, scenario: Scenario) -> list[Case]:
-    """Return the cases at points of the unit cube; the inverse of `to_unit`.
+    """Return the cases at points of the unit cube of a level: the inverse of `to_unit`.
 
     Args:
         points: coordinates between 0 and 1, (n, d).
-        level: the level of the cases.
-        scenario: their scenario.
+        level: level of the cases.
+        scenario: scenario of the cases.
     """
     dims = scenario.dimensions(level)
     v_vut0_mps, _ = scenario.bounds("v_vut0_mps")
@@ -257,22 +271,39 @@ def from_unit(points: FloatArray, level: int, *, scenario: Scenario) -> list[Cas
 
 
 def coordinates(scenario: Scenario, levels: Sequence[int] = LEVELS) -> tuple[Coordinate, ...]:
-    """Return the coordinates that a scenario has at any of some levels, in the pool's order."""
+    """Return the coordinates that a scenario has at any of some levels.
+
+    Args:
+        scenario: the scenario.
+        levels: levels of the POV.
+    """
     return max((scenario.dimensions(level) for level in levels), key=len)
 
 
 def described(case: Case) -> str:
-    """Return the coordinates of a case in one line."""
+    """Return the coordinates of a case in one line.
+
+    Args:
+        case: the case.
+
+    Example:
+        >>> described(Case(level=0, x_pov0_m=-250.0, v_pov0_mps=30.0, scenario=US23))
+        'x_POV0 -250.0 m, v_POV0 30.00 m/s'
+    """
     texts = []
-    for c in coordinates(case.scenario, (case.level,)):
+    for c in case.scenario.dimensions(case.level):
         texts.append(f"{c.name} {c.text(case)} {c.unit}")
     return ", ".join(texts)
 
 
 def outside_of_the_pool(case: Case) -> list[str]:
-    """Return a sentence for each coordinate of a case that is outside of the pool."""
+    """Return a sentence for each coordinate of a case that is outside of the pool.
+
+    Args:
+        case: the case.
+    """
     sentences = []
-    for c in coordinates(case.scenario, (case.level,)):
+    for c in case.scenario.dimensions(case.level):
         value = c.of(case)
         if value is not None and not c.low <= value <= c.high:
             sentences.append(

@@ -1,8 +1,7 @@
-"""What lies between a controller and the road: sensing of other cars, and obedience of the VUT.
+"""Imperfect sensing and actuation of the VUT, as values of a scenario.
 
-Both are values of a scenario. Zero, which is the default, is perfect: the VUT knows the state of
-every car in the step in which it is asked, and its acceleration acts at once. A range makes a
-number a coordinate of the pool: a case calls it `sense_...` or `act_...`.
+By default both are perfect: the VUT knows the state of every car at once, and its acceleration acts
+at once. A number that is a range is a coordinate of the pool, `sense_NAME` or `act_NAME` of a case.
 """
 
 from __future__ import annotations
@@ -10,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Self, TypeVar
+from typing import Any, ClassVar, Self
 
 from merge_sumo.errors import UserError
 from merge_sumo.printable import either, meant
@@ -20,16 +19,20 @@ Amount = float | Bounds
 """A number, or a range: then it is a coordinate of the pool."""
 
 
+@dataclass(frozen=True, kw_only=True, slots=True)
 class Imperfection:
-    """The base of `Sensing` and `Actuation`: numbers in their ranges, by name."""
+    """Base of `Sensing` and `Actuation`: numbers and ranges by name."""
 
-    __slots__ = ()
     possible: ClassVar[dict[str, Bounds]]
-    """Lowest and highest numbers, by field."""
+    """Lowest and highest possible number of each field."""
 
     def __post_init__(self) -> None:
-        """Check the numbers; raises `UserError`."""
-        for field, value in self._given():
+        """Check the numbers.
+
+        Raises:
+            UserError: a number is impossible, or a range is empty.
+        """
+        for field, value in self._numbers():
             low, high = self.possible[field]
             numbers = value if isinstance(value, tuple) else (value,)
             text = "..".join(f"{x:g}" for x in numbers)
@@ -38,40 +41,56 @@ class Imperfection:
             if len(numbers) == 2 and not numbers[0] < numbers[1]:
                 raise UserError(f"{field} is {text}: the first number of a range must be the lower")
 
-    def _given(self) -> Iterator[tuple[str, Amount]]:
-        """Yield (field, value) of all that have one."""
+    def _numbers(self) -> Iterator[tuple[str, Amount]]:
+        """Yield (field, value) of the fields with a value."""
         for field in self.possible:
             if (value := getattr(self, field)) is not None:
                 yield field, value
 
     def to_record(self) -> dict[str, Any]:
-        """Return the imperfect numbers, as JSON keeps them."""
-        default = type(self)()
-        return {name: v for name, v in self._given() if v != getattr(default, name)}
+        """Return the imperfect numbers by field, for JSON."""
+        perfect = type(self)()
+        return {name: v for name, v in self._numbers() if v != getattr(perfect, name)}
 
     @property
     def is_perfect(self) -> bool:
-        """Whether it changes nothing, in any case."""
+        """Whether it has no effect in any case."""
         return not self.to_record()
 
-    @property
-    def ranged(self) -> tuple[str, ...]:
-        """Fields that are coordinates of the pool."""
-        return tuple(name for name, value in self._given() if isinstance(value, tuple))
+    def in_case(self, case: Any, prefix: str) -> Self:
+        """Return the imperfection with the numbers of a case in place of ranges.
+
+        Args:
+            case: a case, with an attribute PREFIX_NAME for each range.
+            prefix: `SENSE` or `ACT`.
+        """
+        numbers: dict[str, Any] = {}
+        for name, value in self._numbers():
+            if isinstance(value, tuple):
+                numbers[name] = getattr(case, f"{prefix}_{name}")
+        return replace(self, **numbers) if numbers else self
 
     def at_most(self, name: str, default: float = math.inf) -> float:
-        """Return the largest value of a number that may be a range; the default without one."""
+        """Return the largest value of a number in any case.
+
+        Args:
+            name: field of the number.
+            default: value for a field without a number.
+        """
         value: Amount | None = getattr(self, name)
         largest = value[1] if isinstance(value, tuple) else value
         return default if largest is None else largest
 
     @classmethod
     def parsed(cls, text: str, option: str) -> Self:
-        """Return an imperfection from the text of an option.
+        """Parse the text of an option.
 
         Args:
-            text: as in "delay_s=0.3,noise_x_m=0..0.5".
-            option: its name, for messages.
+            text: numbers and ranges by name, as in "delay_s=0.3,noise_x_m=0..0.5".
+            option: name of the option, for messages.
+
+        Returns:
+            The imperfection.
 
         Raises:
             UserError: a name is unknown, or a number is missing or wrong.
@@ -96,20 +115,21 @@ class Imperfection:
             raise UserError(f"{option}: {error}") from error
 
 
-Kind = TypeVar("Kind", bound=Imperfection)
-
-
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Sensing(Imperfection):
-    """How the VUT senses the other cars; its own state it knows.
+    """Imperfect sensing of other cars by the VUT. Its own state is always exact.
 
     Attributes:
         delay_s: age of the states that it sees.
-        noise_x_m: standard deviation of the error of a position, drawn again in each step.
-        noise_v_mps: standard deviation of the error of a speed.
-        dropout: share of the steps in which nothing new arrives of a car; the last state is kept.
-        range_m: a car farther away than this, between front bumpers, is not seen.
-        occluded_until_m: no car is seen while the VUT is before this place.
+        noise_x_m: standard deviation of the error of positions, drawn at each step.
+        noise_v_mps: standard deviation of the error of speeds, drawn at each step.
+        dropout: share of the steps in which the last state of a car is repeated.
+        range_m: maximum distance of front bumpers at which a car is seen; None for no limit.
+        occluded_until_m: lane coordinate of the VUT from which it sees other cars; None for all.
+
+    Example:
+        >>> Sensing(delay_s=0.3, noise_x_m=(0.0, 0.5)).to_record()
+        {'delay_s': 0.3, 'noise_x_m': (0.0, 0.5)}
     """
 
     possible: ClassVar[dict[str, Bounds]] = {
@@ -130,19 +150,19 @@ class Sensing(Imperfection):
 
     @property
     def is_random(self) -> bool:
-        """Whether something of it is drawn at random."""
-        names = ("noise_x_m", "noise_v_mps", "dropout")
-        return any(self.at_most(name) > 0.0 for name in names)
+        """Whether states are drawn at random."""
+        return any(self.at_most(name) > 0.0 for name in ("noise_x_m", "noise_v_mps", "dropout"))
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Actuation(Imperfection):
-    """How the VUT obeys the accelerations that its controller commands.
+    """Imperfect execution of the accelerations that a controller commands.
 
     Attributes:
         lag_s: time constant of a first-order lag of the acceleration.
-        delay_s: dead time: a command acts so much later.
-        power_w_per_kg: power over mass; above the speed P / (m a) it limits the acceleration.
+        delay_s: dead time between a command and its effect.
+        power_w_per_kg: power over mass, which limits the acceleration to P / (m v); None for no
+            limit.
     """
 
     possible: ClassVar[dict[str, Bounds]] = {
@@ -161,18 +181,3 @@ PERFECT_ACTUATION = Actuation()
 
 SENSE = "sense"
 ACT = "act"
-
-
-def with_numbers(imperfection: Kind, prefix: str, case: Any) -> Kind:
-    """Return an imperfection with the numbers that a case has for its ranges.
-
-    Args:
-        imperfection: fields that are a number or a range of numbers.
-        prefix: begins the names of these fields in a case.
-        case: the case, with an attribute PREFIX_NAME for each of them.
-    """
-    ranged = imperfection.ranged
-    if not ranged:
-        return imperfection
-    values: dict[str, Any] = {name: getattr(case, f"{prefix}_{name}") for name in ranged}
-    return replace(imperfection, **values)  # type: ignore[type-var]

@@ -1,7 +1,7 @@
-"""Signals: named numbers and words that a controller leaves for each step, such as its mode.
+"""Signals: named numbers and words that a controller sets at each step, such as its mode.
 
-They are kept with the motion of a case, drawn next to it, and exported. Names and words come from
-the user's code: they are bounded, and made printable.
+They are recorded with the motion of a case, plotted and exported. They come from a user's code, so
+their number and length are limited, and texts are made printable.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from itertools import groupby, islice
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 from msgspec import Meta
@@ -20,39 +20,58 @@ from merge_sumo.printable import printable
 StepSignals = dict[str, float | str]
 """Values of one step, by name."""
 Signals = dict[str, tuple[float | str | None, ...]]
-"""By name, a value for each row of the motion of a case; None where none was left."""
+"""Values of a case by name, one for each row of its motion; None where the controller set none."""
 
 MOST_NAMES = 8
-"""Number of signals of a case; others are dropped."""
+"""Maximum number of signals of a case."""
 CHARACTERS = 40
-"""Of a name, and of a word."""
+"""Maximum length of a name, and of a word."""
+
+SignalRuns = Annotated[
+    dict[str, tuple[tuple[Annotated[int, Meta(ge=1)], float | str | None], ...]],
+    Meta(min_length=1, max_length=MOST_NAMES),
+]
+"""Run-length encoded signals for JSON: by name, (number of rows, value) for each run of a value."""
 
 
-def as_signals(left: object) -> StepSignals:
-    """Return the numbers and words that a controller has left; other values are dropped.
+def valid_signals(values: object) -> StepSignals:
+    """Return the signals among the values that a controller has set at a step.
 
-    Numbers have six digits, names and words are cut. A number that is not finite is none.
+    Numbers are rounded to six digits, names and words are cut to `CHARACTERS`. All other values,
+    numbers that are not finite, and values after the first `MOST_NAMES` are dropped.
+
+    Args:
+        values: any object of a user's code.
+
+    Returns:
+        The signals; empty where the object is not a dictionary.
+
+    Example:
+        >>> valid_signals({"mode": "yield", "gap_m": 12.3456789, "plan": [1, 2]})
+        {'mode': 'yield', 'gap_m': 12.3457}
     """
-    if not isinstance(left, dict):
+    if not isinstance(values, dict):
         return {}
-    kept: StepSignals = {}
-    for name, value in islice(left.items(), MOST_NAMES):
-        known = _value(value)
-        if known is not None and isinstance(name, str):
-            kept[_word(name)] = known
-    return kept
+    signals: StepSignals = {}
+    for name, value in islice(values.items(), MOST_NAMES):
+        valid = _valid_value(value)
+        if valid is not None and isinstance(name, str):
+            signals[_word(name)] = valid
+    return signals
 
 
-def _value(value: object) -> float | str | None:
+def _valid_value(value: object) -> float | str | None:
+    if isinstance(value, str):
+        return _word(value)
     if isinstance(value, bool | np.bool_):
         return "true" if value else "false"
-    if isinstance(value, int | float | np.integer | np.floating):
-        try:
-            number = float(f"{float(value):.6g}")
-        except (OverflowError, ValueError):
-            return None
-        return number if math.isfinite(number) else None
-    return _word(value) if isinstance(value, str) else None
+    if not isinstance(value, int | float | np.integer | np.floating):
+        return None
+    try:
+        number = float(f"{float(value):.6g}")
+    except (OverflowError, ValueError):
+        return None
+    return number if math.isfinite(number) else None
 
 
 def _word(text: str) -> str:
@@ -60,16 +79,25 @@ def _word(text: str) -> str:
     return printable(str.__str__(text)[:CHARACTERS])[:CHARACTERS]
 
 
-def series(left: Iterable[tuple[int, StepSignals]], rows: int) -> Signals | None:
-    """Return the signals of a case by its number of rows and the values left: (row, by name).
+def by_name(steps: Iterable[tuple[int, StepSignals]], rows: int) -> Signals | None:
+    """Collect the signals of the steps of a case by name.
 
-    None where nothing was left. Of more than `MOST_NAMES`, the first ones.
+    Args:
+        steps: row of the motion and signals of each step, in ascending order of the rows.
+        rows: number of rows of the motion. Later steps are ignored.
+
+    Returns:
+        The first `MOST_NAMES` signals; None where the controller set none.
+
+    Example:
+        >>> by_name([(0, {"mode": "go"}), (1, {"mode": "yield"})], 3)
+        {'mode': ('go', 'yield', None)}
     """
     columns: dict[str, list[float | str | None]] = {}
-    for row, values in left:
+    for row, signals in steps:
         if row >= rows:
             break
-        for name, value in values.items():
+        for name, value in signals.items():
             if name not in columns:
                 if len(columns) == MOST_NAMES:
                     continue
@@ -78,33 +106,43 @@ def series(left: Iterable[tuple[int, StepSignals]], rows: int) -> Signals | None
     return {name: tuple(values) for name, values in columns.items()} or None
 
 
-def to_record(signals: Signals) -> dict[str, list[list[Any]]]:
-    """Return signals as JSON keeps them: by name, [number of rows, value] for equal values."""
-    record: dict[str, list[list[Any]]] = {}
+def to_runs(signals: Signals) -> SignalRuns:
+    """Return signals in the form in which JSON holds them.
+
+    Args:
+        signals: the signals of a case.
+
+    Example:
+        >>> to_runs({"mode": ("go", "go", None)})
+        {'mode': ((2, 'go'), (1, None))}
+    """
+    record: SignalRuns = {}
     for name, values in signals.items():
-        record[name] = []
+        runs = []
         for value, same in groupby(values):
-            record[name].append([len(list(same)), value])
+            runs.append((len(list(same)), value))
+        record[name] = tuple(runs)
     return record
 
 
-SignalRuns = Annotated[
-    dict[str, tuple[tuple[Annotated[int, Meta(ge=1)], float | str | None], ...]],
-    Meta(min_length=1, max_length=MOST_NAMES),
-]
-"""The result of `to_record`, as JSON has it."""
+def from_runs(record: SignalRuns, rows: int) -> Signals:
+    """Return the signals of a file: the inverse of `to_runs`.
 
+    Args:
+        record: the content of the file.
+        rows: number of rows of the motion of the case.
 
-def from_runs(runs: SignalRuns, rows: int) -> Signals:
-    """Return the signals of a case by its number of rows; `UserError` where they are invalid."""
+    Raises:
+        UserError: a signal has another number of rows, or a value that merge-sumo does not write.
+    """
     signals: Signals = {}
-    for name, pairs in runs.items():
-        if sum(count for count, _ in pairs) != rows:
+    for name, runs in record.items():
+        if sum(count for count, _ in runs) != rows:
             raise UserError("a signal has other rows than the motion")
         values: list[float | str | None] = []
-        for count, value in pairs:
-            if _word(name) != name or (value is not None and _value(value) != value):
-                raise UserError("a signal is not as it was written")
+        for count, value in runs:
+            if _word(name) != name or (value is not None and _valid_value(value) != value):
+                raise UserError("a signal has a value that merge-sumo does not write")
             values += [value] * count
         signals[name] = tuple(values)
     return signals

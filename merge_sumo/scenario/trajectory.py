@@ -15,7 +15,7 @@ from merge_sumo.scenario.signals import Signals
 
 
 class End(StrEnum):
-    """Why an episode ended."""
+    """Reason of the end of an episode."""
 
     MERGED = "MERGED"
     TIMEOUT = "TIMEOUT"
@@ -23,24 +23,25 @@ class End(StrEnum):
     SIM_ERROR = "SIM_ERROR"
 
     @property
-    def is_tested(self) -> bool:
-        """Whether the VUT reached the merge point."""
-        return self is End.MERGED
-
-    @property
     def is_error(self) -> bool:
-        """Whether the VUT or the simulation went wrong; the POV is of the simulation."""
+        """Whether the VUT or the simulation, to which the POV belongs, failed."""
         return self in (End.VUT_ERROR, End.SIM_ERROR)
 
 
 REASON_CHARACTERS = 600
+"""Maximum length of the reason of an error."""
 _ADDRESS = re.compile("0x[0-9a-fA-F]{6,}")
 
 
 def as_reason(text: str) -> str:
-    """Return the reason of an error as records hold it: one printable line, not too long.
+    """Return the reason of an error as records hold it.
 
-    Without memory addresses: they differ from run to run, and records of equal runs must not.
+    Args:
+        text: the message.
+
+    Returns:
+        One printable line of at most `REASON_CHARACTERS`, without memory addresses, in which
+        records of equal runs would differ.
     """
     without = _ADDRESS.sub("0x...", text[: 2 * REASON_CHARACTERS])
     return printable(without[:REASON_CHARACTERS])[:REASON_CHARACTERS]
@@ -50,19 +51,25 @@ def as_reason(text: str) -> str:
 class Trajectory:
     """Positions, speeds and accelerations of all vehicles in one episode.
 
-    `motion` has shape (T + 1, A, 3): one row per step, from t = 0 to the end of the episode; the
-    vehicles POV, VUT and, in traffic, the cars ahead of and behind the POV; their x, v and a in m,
-    m/s and m/s2. The acceleration of a step acts from it to the next; it is 0 in the last one.
+    A motion has shape (T + 1, A, 3): one row per step, from t = 0 to the end; the vehicles POV, VUT
+    and, in traffic, the cars ahead of and behind the POV; x in m, v in m/s and a in m/s2. The
+    acceleration of a row acts until the next row, and is 0 in the last one.
 
     Attributes:
         case: the case.
-        motion: up to M.
-        end: MERGED whenever the VUT arrived at M, also after a contact.
-        error: the fault of the VUT or of the simulation; after M in a case that MERGED.
+        motion: motion up to M.
+        end: reason of the end. It is MERGED whenever the VUT arrived at M, also after a contact.
+        error: fault of the VUT or of the simulation; None without one. A case that MERGED has the
+            fault after M.
         clipped_steps: number of answers of the VUT that were clipped to its limits.
-        after: the motion after M where the scenario has a follow-up, from the row of the merge on.
-        signals: those of the VUT for each row of both.
-        in_vain: commands of the VUT that were accepted, and changed nothing.
+        after: motion after M, from the row of the merge; None without a follow-up.
+        signals: signals of the VUT for each row of `whole`; None without any.
+        in_vain: commands of the VUT that were accepted and had no effect.
+
+    Example:
+        >>> trajectory = run.recorded.trajectory(0)
+        >>> trajectory.x_vut_m[0], trajectory.t_end_s
+        (-182.0, 8.7)
     """
 
     case: Case
@@ -75,7 +82,7 @@ class Trajectory:
     in_vain: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
-        """Return its end in a line: the motion is an array of hundreds of numbers."""
+        """Return the size and the end of the motion, which has hundreds of numbers."""
         cars, rows = self.motion.shape[1], len(self.motion)
         return f"<Trajectory: {cars} vehicles, {rows} rows, {self.end} at {self.t_end_s:.1f} s>"
 
@@ -88,56 +95,65 @@ class Trajectory:
 
     @property
     def x_pov_m(self) -> FloatArray:
-        """Positions of the POV, (T + 1,)."""
+        """Positions of the POV in m, (T + 1,)."""
         return self.motion[:, POV, 0]
 
     @property
     def v_pov_mps(self) -> FloatArray:
-        """Speeds of the POV, (T + 1,)."""
+        """Speeds of the POV in m/s, (T + 1,)."""
         return self.motion[:, POV, 1]
 
     @property
     def a_pov_mps2(self) -> FloatArray:
-        """Accelerations of the POV, (T + 1,), the last one 0."""
+        """Accelerations of the POV in m/s2, (T + 1,)."""
         return self.motion[:, POV, 2]
 
     @property
     def x_vut_m(self) -> FloatArray:
-        """Positions of the VUT, (T + 1,)."""
+        """Positions of the VUT in m, (T + 1,)."""
         return self.motion[:, VUT, 0]
 
     @property
     def v_vut_mps(self) -> FloatArray:
-        """Speeds of the VUT, (T + 1,)."""
+        """Speeds of the VUT in m/s, (T + 1,)."""
         return self.motion[:, VUT, 1]
 
     @property
     def a_vut_mps2(self) -> FloatArray:
-        """Accelerations of the VUT, (T + 1,), the last one 0."""
+        """Accelerations of the VUT in m/s2, (T + 1,)."""
         return self.motion[:, VUT, 2]
 
     @property
     def nearest(self) -> int:
-        """Row of the car of the mainline that is nearest to the VUT at the end."""
-        if self.motion.shape[1] == 2:
-            return POV
-        cars = [row for row in range(self.motion.shape[1]) if row != VUT]
-        return min(cars, key=lambda row: abs(self.motion[-1, row, 0] - self.motion[-1, VUT, 0]))
+        """Index of the car of the mainline that is nearest to the VUT at the end of `motion`."""
+        apart_m = np.abs(self.motion[-1, :, 0] - self.motion[-1, VUT, 0])
+        apart_m[VUT] = np.inf
+        return int(np.argmin(apart_m))
 
     def with_pov(self, car: int) -> Trajectory:
-        """Return the motion up to M of the VUT and one car of the mainline, in the POV's row."""
+        """Return the motion up to M of the VUT and one car of the mainline.
+
+        Args:
+            car: index of that car, which takes the place of the POV.
+        """
         return replace(self, motion=self.motion[:, [car, VUT]], after=None)
 
     @property
     def t_end_s(self) -> float:
-        """Time of the last row."""
+        """Time of the last row of `motion`, in s."""
         return round((len(self.motion) - 1) * DT_S, 1)
 
 
 def cut_at(whole: FloatArray, row: int) -> tuple[FloatArray, FloatArray | None]:
-    """Return the motion up to the row of the merge, and that after it; None where it ends there.
+    """Split a motion at the merge.
 
-    The acceleration in the last row of a motion is 0.
+    Args:
+        whole: motion of the episode, (T + 1, A, 3).
+        row: row of the merge.
+
+    Returns:
+        The motion up to the merge, with accelerations of 0 in its last row, and the motion from
+        there; None where the episode ends at the merge.
     """
     if len(whole) <= row + 1:
         return whole, None

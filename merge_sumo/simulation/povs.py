@@ -263,5 +263,7 @@ def seen_from(case: Case, car: int) -> Case:
     x_m, v_mps = starts[car]
     x_vut0_m = min(x_m, BEFORE_M)
     scenario = replace(case.scenario, x_vut0_m=x_vut0_m, v_vut0_mps=v_mps, lane_m=None)
-    told = vut, (x_m, v_mps)
-    return ObservedCase(level=0, v_vut0_mps=v_mps, draw=case.draw, scenario=scenario, told=told)
+    observed = vut, (x_m, v_mps)
+    return ObservedCase(
+        level=0, v_vut0_mps=v_mps, draw=case.draw, scenario=scenario, observed=observed
+    )

@@ -19,9 +19,9 @@ from merge_sumo.scenario.signals import (
     MOST_NAMES,
     SignalRuns,
     Signals,
-    as_signals,
     from_runs,
-    to_record,
+    to_runs,
+    valid_signals,
 )
 
 LEAVES = """
@@ -90,7 +90,7 @@ def test_hostile_names_and_words_are_cut_without_harm(write_vut, tmp_path):
     "left", [None, 3, [1], "mode", {1: 2.0}, {"x": None}, {"x": float("inf")}, {}, {"x": [1.0]}]
 )
 def test_what_is_no_number_and_no_word_is_dropped(left):
-    assert as_signals(left) == {}
+    assert valid_signals(left) == {}
 
 
 @pytest.mark.parametrize(
@@ -118,4 +118,4 @@ def test_a_file_of_a_stranger_is_refused(record):
 
 def test_what_is_kept_is_read_as_it_was():
     signals: Signals = {"mode": ("go", "go", None), "gap_m": (1.5, -2.0, None)}
-    assert from_runs(decode(json.dumps(to_record(signals)), SignalRuns), 3) == signals
+    assert from_runs(decode(json.dumps(to_runs(signals)), SignalRuns), 3) == signals
