@@ -578,7 +578,9 @@ def run_and_report(
             result = CampaignRun(done, config.gates)
             study = run_study.RunStudy(done, settings, replace(plan, against=None), available)
             on_part = partial(_count, bars, check)
-            counterfactuals.write_avoidance(study, partial(on_part, "careful drivers", "failures"))
+            counterfactuals.write_avoidance(
+                study, partial(on_part, "reference drivers", "failures")
+            )
             share.write_shares(study, partial(on_part, "uniform starts", "cases"))
             explanation.write_worst_explanation(study)
             link_latest(folder)

@@ -36,7 +36,7 @@ SIMULATING = {
     f"merge_sumo.{room}" for room in ("sumo", "drivers", "controllers", "simulation", "training")
 }
 REPORTS_READ = {
-    "merge_sumo.drivers.reference.REFERENCES",  # names of the reference drivers
+    "merge_sumo.drivers.reference_drivers.REFERENCE_DRIVERS",  # names of the reference drivers
     "merge_sumo.sumo.opendrive.opendrive",  # writes files for other simulators
     "merge_sumo.controllers.process.LOG",  # the end of what a controller printed
     "merge_sumo.controllers.process.end_of",

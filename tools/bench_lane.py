@@ -4,9 +4,9 @@
 
 The VUT drives the level-0 profile and merges at a place that the POV does not know: where the lane
 begins, at M, in the middle of the rest, at the lane's end. The POV is that of level 1 by the rule
-of `merge_sumo/drivers/lane.py`. Its return up to the merge is compared with the exact best response
-of a driver that knows the place. Regret is a share of what that driver gains over one that keeps
-its speed; for M it is that of the point merge.
+of `merge_sumo/drivers/after_merge.py`. Its return up to the merge is compared with the exact best
+response of a driver that knows the place. Regret is a share of what that driver gains over one that
+keeps its speed; for M it is that of the point merge.
 
 Then how hard cars brake in the 5 s after merges at M that need at most 1 m/s2 of the car behind, at
 level 0: by ACC, as they do, and by IDM.
@@ -19,9 +19,10 @@ from collections.abc import Sequence
 import numpy as np
 from measuring import append_record, benchmark_parser
 
-from merge_sumo.drivers import lane
+from merge_sumo.drivers import after_merge
+from merge_sumo.drivers.after_merge import PovAfterMerge
 from merge_sumo.drivers.base import MERGE, STAY, Driver, Scene
-from merge_sumo.drivers.lane import PovAfterMerge, acc_mps2, idm_mps2
+from merge_sumo.drivers.car_following import acc_mps2, idm_mps2
 from merge_sumo.drivers.level0 import Level0Pov, Level0Vut
 from merge_sumo.drivers.policies import load_driver
 from merge_sumo.metrics.merge import brake_after_mps2
@@ -105,7 +106,7 @@ def hard_braking(cases: Sequence[Case]) -> dict[str, int]:
     print("followers   merges that need at most 1 m/s2   harder than 3 m/s2 after them")
     for name, follow in (("ACC", acc_mps2), ("IDM", idm)):
         pov = PovAfterMerge(Level0Pov(len(cases)))
-        lane.acc_mps2 = follow  # type: ignore[assignment]
+        after_merge.acc_mps2 = follow  # type: ignore[attr-defined, assignment]
         merges = played(cases, pov, MergesAt(len(cases), 0.0))
         easy = [one for one in merges if 0.0 < brake_after_mps2(one) <= 1.0]
         hard = [one for one in easy if one.after is not None and one.after[:, 0, 2].min() < -3.0]

@@ -19,7 +19,7 @@ from merge_sumo.analysis.counterfactuals import TAKES_OVER, write_avoidance
 from merge_sumo.analysis.run_study import RunStudy
 from merge_sumo.campaigns.campaign import run_campaign
 from merge_sumo.campaigns.settings import CampaignSettings
-from merge_sumo.drivers.reference import REFERENCES
+from merge_sumo.drivers.reference_drivers import REFERENCE_DRIVERS
 from merge_sumo.metrics.summary import summarise
 from merge_sumo.scenario.scenario import LEVELS, US23
 from merge_sumo.scenario.trajectory import End
@@ -29,7 +29,7 @@ MODELS = ("Krauss", "IDM", "EIDM", "ACC", "CACC")
 VUTS = (
     *("design1", "design2", "level1", "level2"),
     *(f"sumo:{model}" for model in MODELS),
-    *("level0", *REFERENCES),
+    *("level0", *REFERENCE_DRIVERS),
 )
 HEAD = (
     "| VUT | failures at levels 0, 1, 2 | timeouts | FMC at levels 0, 1, 2 | avoided by `careful` "

@@ -25,9 +25,9 @@ from merge_sumo.campaigns.recorded import failures
 from merge_sumo.controllers.kinds import load
 from merge_sumo.controllers.process import LOG
 from merge_sumo.drivers.base import MERGE, STAY, Driver, DriverWrapper, Scene
-from merge_sumo.drivers.lane import follow_mps2
+from merge_sumo.drivers.car_following import follow_mps2
 from merge_sumo.drivers.levelk import DECISION_STEPS
-from merge_sumo.drivers.reference import REFERENCES, CarefulPov
+from merge_sumo.drivers.reference_drivers import REFERENCE_DRIVERS, CarefulPov
 from merge_sumo.metrics.merge import brake_after_mps2
 from merge_sumo.records import Record
 from merge_sumo.road.loader import centre_lines
@@ -60,7 +60,7 @@ class Avoidance(Record, frozen=True):
     """
 
     index: int
-    avoided_by: tuple[Literal[*REFERENCES], ...]  # type: ignore[valid-type]
+    avoided_by: tuple[Literal[*REFERENCE_DRIVERS], ...]  # type: ignore[valid-type]
     latest_takeover_s: EpisodeTime | None
     pov_careful: bool
 
@@ -160,7 +160,7 @@ def avoidances(plan: SimulationPlan, failing: Sequence[tuple[int, Trajectory]]) 
     motions = [motion for _, motion in failing]
     cases = []
     # One driver after the other: a driver that is in no corridor costs nothing.
-    for name in REFERENCES:
+    for name in REFERENCE_DRIVERS:
         cases += [Counterfactual.of(motion, by=name) for motion in motions]
     for motion in motions:
         cases.append(Counterfactual.of(motion, until=_steps(motion), careful_pov=True))
@@ -170,7 +170,7 @@ def avoidances(plan: SimulationPlan, failing: Sequence[tuple[int, Trajectory]]) 
     found = []
     for row, (index, _) in enumerate(failing):
         *by_name, pov_careful = avoided[:, row].tolist()
-        names = tuple(compress(REFERENCES, by_name))
+        names = tuple(compress(REFERENCE_DRIVERS, by_name))
         found.append(Avoidance(index, names, latest_s[row], pov_careful))
     return found
 
@@ -228,7 +228,7 @@ class _Substitutes(Driver):
 
     def __init__(self, corridors: int) -> None:
         super().__init__(corridors)
-        self._drivers = {name: make(corridors) for name, make in REFERENCES.items()}
+        self._drivers = {name: make(corridors) for name, make in REFERENCE_DRIVERS.items()}
         self._by = np.zeros(corridors, dtype=np.int64)
         self._until = np.zeros(corridors, dtype=np.int64)
         self._recorded = np.zeros((RING_ROWS, corridors))

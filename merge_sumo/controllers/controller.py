@@ -12,7 +12,7 @@ import numpy as np
 
 from merge_sumo.controllers.deadline import Deadline, closed, text_of
 from merge_sumo.drivers.base import MERGE, NO_REQUEST, STAY, Driver, Scene
-from merge_sumo.drivers.following import conflicting_car
+from merge_sumo.drivers.car_following import conflicting_car
 from merge_sumo.scenario.case import Case, FloatArray
 from merge_sumo.scenario.scenario import DT_S, POV, VUT, Bounds
 from merge_sumo.scenario.signals import StepSignals
@@ -45,7 +45,7 @@ class Seen(_State):
 
     In traffic the conflicting car counts as POV: the one that would be nearest to M when the VUT is
     there, if the car kept its speed and the VUT drove the scenario's level-0 profile
-    (`drivers.following.conflicting_car`). `others` has all cars.
+    (`drivers.car_following.conflicting_car`). `others` has all cars.
 
     On a road with an acceleration lane the lane begins at `lane_begin_m` and ends at `lane_end_m`;
     M is where a merge is expected. Elsewhere both are 0, and the VUT merges at M.

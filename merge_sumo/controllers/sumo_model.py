@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from merge_sumo.controllers.spec import ControllerKind, ControllerOptions, ControllerSpec
+from merge_sumo.drivers.acceleration_lane import speed_to_stop_mps
 from merge_sumo.drivers.base import MERGE, STAY, Driver, Scene
-from merge_sumo.drivers.lane import speed_to_stop_mps
 from merge_sumo.errors import UserError
 from merge_sumo.scenario.case import FloatArray
 from merge_sumo.scenario.scenario import DT_S, VUT

@@ -59,6 +59,19 @@ class Scene(NamedTuple):
         """Speeds of the VUT, (K,)."""
         return np.asarray(self.v_mps[VUT])
 
+    @property
+    def distance_m(self) -> FloatArray:
+        """Distances of the VUT to M, (K,); 0 after M."""
+        return np.maximum(-self.x_vut_m, 0.0)
+
+    def dx_at_m(self, t_s: FloatArray) -> FloatArray:
+        """Predict dx at M, (K,), for a POV that keeps its speed; after M, from the VUT.
+
+        Args:
+            t_s: times until the VUT is at M, (K,); 0 after M.
+        """
+        return self.x_pov_m - np.maximum(self.x_vut_m, 0.0) + self.v_pov_mps * t_s
+
     def _of_conflicting(self, values: FloatArray) -> FloatArray:
         if self.conflicting is None:
             return np.asarray(values[POV])

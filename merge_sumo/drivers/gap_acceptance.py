@@ -55,8 +55,7 @@ class GapAcceptanceVut(Level0Vut):
     def act(self, scene: Scene) -> FloatArray:
         """Return the level-0 acceleration where it goes, else the braking to stop at the line."""
         design, v = self.design, scene.v_vut_mps
-        # A POV drives after M as well.
-        distance_m = np.maximum(-scene.x_vut_m, 0.0)
+        distance_m = scene.distance_m
         due_s = level0_time_to(distance_m, v, self.scenario)
         # A standing POV is due in hours.
         later_s = -scene.x_pov_m / np.maximum(scene.v_pov_mps, 1e-3) - due_s

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from merge_sumo.drivers.acceleration_lane import stopping_mps
 from merge_sumo.drivers.base import MERGE, NO_REQUEST, STAY, BuiltInVut, Design, Scene
-from merge_sumo.drivers.lane import acc_mps2, car_ahead, stopping_mps
+from merge_sumo.drivers.car_following import acc_mps2, car_ahead
 from merge_sumo.drivers.level0 import Level0Vut
 from merge_sumo.errors import UserError
 from merge_sumo.scenario.case import Case, FloatArray

@@ -108,8 +108,17 @@ def features(
         (v_pov_mps - v_hw) / (4.0 * unit.speed),
     ]
     if svo_rad is not None:
-        columns += [np.cos(svo_rad) * 2.0 - 1.0, np.sin(svo_rad) * 2.0 - 1.0]
+        columns += svo_features(svo_rad)
     return np.stack(columns, axis=-1)
+
+
+def svo_features(svo_rad: FloatArray) -> list[FloatArray]:
+    """Return the inputs of a network for social value orientations, two arrays of their shape.
+
+    Args:
+        svo_rad: social value orientations of the POV, in rad.
+    """
+    return [np.cos(svo_rad) * 2.0 - 1.0, np.sin(svo_rad) * 2.0 - 1.0]
 
 
 def prospects(

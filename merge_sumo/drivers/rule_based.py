@@ -79,10 +79,8 @@ class RuleBasedVut(Level0Vut):
     def act(self, scene: Scene) -> FloatArray:
         """Return the commanded acceleration, (K,), after the actuator's lag if there is one."""
         design = self.design
-        distance = np.maximum(-scene.x_vut_m, 0.0)
-        t_m = level0_time_to(distance, scene.v_vut_mps, self.scenario)
-        # After M, the present gap.
-        dx_at_m = scene.x_pov_m + scene.v_pov_mps * t_m - np.maximum(scene.x_vut_m, 0.0)
+        distance = scene.distance_m
+        dx_at_m = scene.dx_at_m(level0_time_to(distance, scene.v_vut_mps, self.scenario))
         command = super().act(scene)
         too_close = (np.abs(dx_at_m) < design.gap_m) & (distance <= design.x1_m)
         command[too_close] = 0.0

@@ -6,7 +6,7 @@ import numpy as np
 
 from merge_sumo.drivers.actuation import whole_steps
 from merge_sumo.drivers.base import Driver, DriverWrapper, Scene
-from merge_sumo.drivers.following import conflicting_car
+from merge_sumo.drivers.car_following import conflicting_car
 from merge_sumo.scenario.case import Case, FloatArray, ObservedCase
 from merge_sumo.scenario.scenario import DT_S, VUT, Scenario
 

@@ -22,7 +22,7 @@ from merge_sumo.scenario.trajectory import End, Trajectory
 
 REACTION_S = 0.75
 """tau, from seeing the danger to braking, of the competent and careful driver of UN Regulation No.
-157 (`drivers/reference.py`)."""
+157 (`drivers/reference_drivers.py`)."""
 STANDS_MPS = 0.1
 """Speed below which a VUT stands."""
 HARSH_MPS2 = 3.0

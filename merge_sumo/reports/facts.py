@@ -23,7 +23,7 @@ from merge_sumo.campaigns.recorded import (
     RecordedCampaign,
     failures,
 )
-from merge_sumo.drivers.reference import REFERENCES
+from merge_sumo.drivers.reference_drivers import REFERENCE_DRIVERS
 from merge_sumo.metrics.cause import diagnose, kind_and_severity
 from merge_sumo.metrics.fmc import radius_for
 from merge_sumo.metrics.merge import Severity
@@ -249,7 +249,7 @@ def _avoided(run: RecordedCampaign, undecided: frozenset[int]) -> Facts:
     fact = partial(Fact, file=AVOIDANCE.name)
     if len(known) < sum(outcome.failed for outcome in run.cases) - len(undecided):
         yield fact(DRIVEN, len(known), "lines")
-    for name in REFERENCES:
+    for name in REFERENCE_DRIVERS:
         number = sum(name in one.avoided_by for one in known)
         yield fact(AVOIDED.format(name), number, "avoided_by")
     yield fact(AVOIDED_BY_POV, sum(one.pov_careful for one in known), "pov_careful")

@@ -22,7 +22,7 @@ from merge_sumo.campaigns.printed_commands import campaign_command
 from merge_sumo.campaigns.recorded import OUTCOMES, RecordedCampaign
 from merge_sumo.campaigns.repeatability import read_second_runs, unrepeatable
 from merge_sumo.controllers.process import LOG, end_of
-from merge_sumo.drivers.reference import REFERENCES
+from merge_sumo.drivers.reference_drivers import REFERENCE_DRIVERS
 from merge_sumo.errors import UserError
 from merge_sumo.files import GENERATOR, check_generated, replace_own
 from merge_sumo.metrics.cause import BRAKED_MPS, MEANINGS
@@ -166,6 +166,6 @@ def report_page(run: RecordedCampaign, *, learns: bool = True, running: bool = F
         kind_meanings=MEANINGS,
         pairs_of=pairs_of,
         radius_for=radius_for,
-        references=list(REFERENCES),
+        references=list(REFERENCE_DRIVERS),
         braked_mps=BRAKED_MPS,
     )

@@ -29,7 +29,7 @@ from merge_sumo.analysis.truth import DENSE_CASES, REAL_REGION, Truth, TruthResu
 from merge_sumo.analysis.vut_check import VutCheck
 from merge_sumo.campaigns.printed_commands import campaign_command, command
 from merge_sumo.campaigns.recorded import RecordedCampaign
-from merge_sumo.drivers.reference import REFERENCES
+from merge_sumo.drivers.reference_drivers import REFERENCE_DRIVERS
 from merge_sumo.metrics.cause import cause, conflicting_car
 from merge_sumo.metrics.criterion import Criterion
 from merge_sumo.metrics.fmc import fmc, radius_for
@@ -117,7 +117,7 @@ def headline(run: RecordedCampaign, facts: Sequence[Fact]) -> list[str]:
         number = _counted(of["failures"], "failure")
         if DRIVEN in of:
             number = f"{of[DRIVEN].shown} of {number}"
-        drivers = [f"{name} {of[AVOIDED.format(name)].shown}" for name in REFERENCES]
+        drivers = [f"{name} {of[AVOIDED.format(name)].shown}" for name in REFERENCE_DRIVERS]
         pov = f"by a careful POV {of[AVOIDED_BY_POV].shown}"
         lines.append(f"avoided of {number}: by driver {', '.join(drivers)}, {pov}")
     if WORST in of:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from merge_sumo.drivers.following import conflicting_car, keep_safe
+from merge_sumo.drivers.car_following import conflicting_car, keep_safe
 from merge_sumo.drivers.levelk import (
     DECISION_STEPS,
     QNetwork,

@@ -9,10 +9,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from merge_sumo.drivers.acceleration_lane import Merging
 from merge_sumo.drivers.actuation import ROUNDING_MPS2
 from merge_sumo.drivers.base import ControllerDiedError, Driver, PovDiedError, Scene
-from merge_sumo.drivers.following import conflicting_car, keep_safe
-from merge_sumo.drivers.lane import Merging
+from merge_sumo.drivers.car_following import conflicting_car, keep_safe
 from merge_sumo.scenario.case import Case, FloatArray
 from merge_sumo.scenario.scenario import DT_S, MAX_EPISODE_S, OWN, VUT
 from merge_sumo.scenario.signals import StepSignals, by_name

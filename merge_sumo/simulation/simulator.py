@@ -7,8 +7,8 @@ from contextlib import ExitStack
 from typing import Self
 
 from merge_sumo.drivers.actuation import ActuatedDriver
+from merge_sumo.drivers.after_merge import PovAfterMerge
 from merge_sumo.drivers.base import Driver
-from merge_sumo.drivers.lane import PovAfterMerge
 from merge_sumo.drivers.sensing import SensedDriver
 from merge_sumo.scenario.case import Case
 from merge_sumo.scenario.scenario import Scenario

@@ -22,9 +22,8 @@ from merge_sumo.simulation.plan import SimulationPlan
 from merge_sumo.simulation.povs import Povs
 from merge_sumo.training.best_response import beam_search, best_response
 from merge_sumo.training.game import Game, greedy, of_two
-from merge_sumo.training.reward import Reward, RewardParts, RewardWeights, Role
+from merge_sumo.training.reward import Reward, RewardParts, Role
 
-CHECK_CASES = 300
 OPPONENTS: dict[str, tuple[Role, str]] = {
     "pov1": ("pov", "level0"),
     "vut1": ("vut", "level0"),
@@ -32,6 +31,23 @@ OPPONENTS: dict[str, tuple[Role, str]] = {
     "vut2": ("vut", "pov1"),
 }
 """Role and opponent of each network, in the order of the helix."""
+
+
+def game_of(name: str, folder: Path, scenario: Scenario, a_min_mps2: float | None) -> Game:
+    """Return the game in which a network is trained and checked.
+
+    Args:
+        name: name of the network, such as "pov1".
+        folder: folder of its opponent.
+        scenario: the scenario that is played.
+        a_min_mps2: hardest braking of the agent; None for that of the scenario.
+
+    Raises:
+        UserError: if the opponent is missing.
+    """
+    role, opponent = OPPONENTS[name]
+    network = None if opponent == "level0" else load_network(opponent, folder)
+    return Game(role, network, Reward.of(scenario), a_min_mps2)
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,10 +98,8 @@ def returns_of(trajectories: list[Trajectory], reward: Reward) -> RewardParts:
 def check_policy(
     name: str,
     folder: Path,
-    count: int = CHECK_CASES,
-    *,
+    count: int,
     scenario: Scenario,
-    weights: RewardWeights | None = None,
 ) -> PolicyCheck:
     """Compare a network with its best response.
 
@@ -94,33 +108,28 @@ def check_policy(
         folder: folder of the networks.
         count: number of random cases of the pool.
         scenario: the scenario that is played.
-        weights: weights of the reward; by default those of the scenario.
+
+    Raises:
+        UserError: if the network or its opponent is missing.
     """
-    scenario = of_two(scenario)
-    reward = Reward(weights or RewardWeights.of(scenario), scenario)
-    role, other = OPPONENTS[name]
-    level = 2 if name == "pov2" else 1
+    network = load_network(name, folder)
+    game = game_of(name, folder, of_two(scenario), network.a_min_mps2)
+    scenario, reward = game.scenario, game.reward
+    level = 2 if game.sees_svo else 1
     points = np.random.default_rng(20_201).random((count, len(scenario.dimensions(level))))
     cases = from_unit(points, level, scenario=scenario)
     svo_rad = np.array([case.svo_rad or SVO.low for case in cases])
-    if role == "pov":
-        trajectories = _play(cases, name, other, folder)
-        without = _play(cases, "level0", other, folder)
-    else:
-        trajectories = _play(cases, other, name, folder)
-        without = _play(cases, other, "level0", folder)
-    reached = returns_of(trajectories, reward).of(role, svo_rad)
-    level0 = returns_of(without, reward).of(role, svo_rad)
+    trajectories = _play(cases, name, name, folder)
+    without = _play(cases, name, "level0", folder)
+    reached = returns_of(trajectories, reward).of(game.role, svo_rad)
+    level0 = returns_of(without, reward).of(game.role, svo_rad)
     collided = np.array([is_close(one) for one in trajectories])
-    network = load_network(name, folder)
-    opponent = None if other == "level0" else load_network(other, folder)
-    game = Game(role, opponent, reward, network.a_min_mps2)
     start = np.array([np.ravel(case.starts()) for case in cases])
-    if opponent is None:
+    if game.opponent is None:
         best = best_response(game, start, reached)
     else:
         searched, _ = beam_search(game, start, svo_rad, network)
-        rolled_out = game.play(start, svo_rad, game.improved(greedy(network, game.scenario)))
+        rolled_out = game.play(start, svo_rad, game.improved(greedy(network, scenario)))
         # The games of the driver are some that a search may find.
         best = np.maximum(np.maximum(searched, rolled_out), reached)
     gain = float((best - level0).mean())
@@ -137,15 +146,17 @@ def check_policy(
     )
 
 
-def _play(cases: list[Case], pov: str, vut: str, folder: Path) -> list[Trajectory]:
-    """Run cases in SUMO.
+def _play(cases: list[Case], name: str, agent: str, folder: Path) -> list[Trajectory]:
+    """Run the cases of a network in SUMO, with an agent against its opponent.
 
     Args:
         cases: the cases.
-        pov: name of the network that drives the POV, or "level0".
-        vut: the same of the VUT.
+        name: name of the network.
+        agent: the driver in its place: the network itself, or "level0".
         folder: folder of the networks.
     """
+    role, opponent = OPPONENTS[name]
+    pov, vut = (agent, opponent) if role == "pov" else (opponent, agent)
     scenario, level = cases[0].scenario, int(pov[-1])
     plan = SimulationPlan(
         scenario=scenario,

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from copy import deepcopy
 from dataclasses import dataclass
 from itertools import chain
 
@@ -22,7 +23,14 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from merge_sumo.drivers.levelk import ACTIONS, FEATURES, SVO_FEATURES, QNetwork, features
+from merge_sumo.drivers.levelk import (
+    ACTIONS,
+    FEATURES,
+    SVO_FEATURES,
+    QNetwork,
+    features,
+    svo_features,
+)
 from merge_sumo.scenario.scenario import SVO
 from merge_sumo.training.game import Game, IntArray, exploring_starts
 from merge_sumo.training.reward import RewardParts
@@ -36,49 +44,119 @@ GAMES = 64
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class DdqnSettings:
-    """Settings of `train`."""
+    """Settings of `train`.
 
-    transitions: int = 150_000  # size of the replay; every transition is kept
-    updates: int = 12_000  # gradient steps; the transitions are all in after `collecting` of them
-    collecting: float = 0.6  # share of the updates during which transitions are collected
-    warm_up: int = 10_000  # transitions before the first update
-    batch: int = 512  # transitions per update
-    width: int = 128  # units of each of the two hidden layers
-    learning_rate: float = 1e-3  # at the start; falls to `last_learning_rate` along a cosine
-    last_learning_rate: float = 1e-5  # at the end
+    Attributes:
+        transitions: size of the replay buffer, which keeps every transition.
+        updates: number of gradient steps.
+        collecting: share of the updates during which transitions are collected.
+        warm_up: transitions before the first update.
+        batch: transitions per update.
+        width: units of each of the two hidden layers.
+        learning_rate: learning rate at the start; it falls to `last_learning_rate` along a cosine.
+        last_learning_rate: learning rate at the end.
+        exploration: share of random actions at the start. It falls linearly to `last_exploration`,
+            which it reaches with half of the transitions.
+        last_exploration: share of random actions from then on.
+        gradient_norm: bound to which the gradient is clipped.
+        midway: share of games that begin mid-way (`game.exploring_starts`).
+    """
+
+    transitions: int = 150_000
+    updates: int = 12_000
+    collecting: float = 0.6
+    warm_up: int = 10_000
+    batch: int = 512
+    width: int = 128
+    learning_rate: float = 1e-3
+    last_learning_rate: float = 1e-5
     exploration: float = 1.0
-    """Share of random actions at the start; falls linearly to `last_exploration` when half of
-    the transitions are in."""
-    last_exploration: float = 0.1  # share of random actions from then on
-    gradient_norm: float = 10.0  # bound to which the gradient is clipped
-    midway: float = 0.6  # share of games that begin mid-way
+    last_exploration: float = 0.1
+    gradient_norm: float = 10.0
+    midway: float = 0.6
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class TrainingProgress:
-    """The progress of training, after every thousand updates of DDQN or a round of refinement."""
+    """The progress of training, after every thousand updates of DDQN or a round of refinement.
 
-    network: str = ""  # its name
-    stage: str = "ddqn"  # or "refine"
-    done: int  # updates or rounds done in this stage
-    total: int  # updates or rounds of this stage
-    loss: float  # of DDQN's fit, or the mean loss of return that a choice of the network means
-    mean_return: float  # of the games played lately, from exploring starts
+    Attributes:
+        network: name of the network.
+        stage: "ddqn" or "refine".
+        done: updates or rounds that are done in this stage.
+        total: updates or rounds of this stage.
+        loss: loss of the last update of DDQN, or the mean cost of a choice in refinement.
+        mean_return: mean return of recent games from exploring starts.
+    """
+
+    network: str = ""
+    stage: str = "ddqn"
+    done: int
+    total: int
+    loss: float
+    mean_return: float
 
 
 def squash(q: Tensor) -> Tensor:
-    """Return q above -2 and a logarithm of it below."""
-    return torch.where(
-        q >= SQUASH_BELOW,
-        q,
-        SQUASH_BELOW - torch.log1p(torch.clamp(SQUASH_BELOW - q, min=0.0)),
-    )
+    """Squash action values, of any shape: the identity above -2, and logarithmic below.
+
+    Args:
+        q: action values.
+
+    Returns:
+        The squashed values, in the same order.
+    """
+    depth = torch.clamp(SQUASH_BELOW - q, min=0.0)
+    return torch.where(q >= SQUASH_BELOW, q, SQUASH_BELOW - torch.log1p(depth))
 
 
 def unsquash(squashed: Tensor) -> Tensor:
-    """Return the inverse of `squash`, bounded so that an early estimate cannot overflow."""
+    """Invert `squash`, with a bound so that an early estimate cannot overflow.
+
+    Args:
+        squashed: squashed values, of any shape.
+
+    Returns:
+        The action values.
+    """
     depth = torch.clamp(SQUASH_BELOW - squashed, min=0.0, max=4.0)
     return torch.where(squashed >= SQUASH_BELOW, squashed, SQUASH_BELOW - torch.expm1(depth))
+
+
+class Learner:
+    """A network that Adam trains, and the Polyak average of its weights.
+
+    Example:
+        learner = Learner(make_network(FEATURES, 128))
+        learner.descend(loss, learning_rate=1e-3, gradient_norm=10.0)
+
+    Attributes:
+        network: the network that learns.
+        average: network with the average of the weights: the target of DDQN, and the result.
+    """
+
+    def __init__(self, network: nn.Sequential) -> None:
+        """Begin with an average that equals the network."""
+        self.network, self.average = network, deepcopy(network)
+        self._weights: list[Tensor] = list(network.parameters())
+        self._averages: list[Tensor] = list(self.average.parameters())
+        self._optimiser = torch.optim.Adam(self._weights, fused=True)
+
+    def descend(self, loss: Tensor, learning_rate: float, gradient_norm: float) -> None:
+        """Take one gradient step.
+
+        Args:
+            loss: the loss.
+            learning_rate: learning rate of this step.
+            gradient_norm: bound to which the gradient is clipped.
+        """
+        self._optimiser.param_groups[0]["lr"] = learning_rate
+        self._optimiser.zero_grad()
+        loss.backward()  # type: ignore[no-untyped-call]
+        nn.utils.clip_grad_norm_(self._weights, gradient_norm)
+        self._optimiser.step()
+        with torch.no_grad():
+            torch._foreach_lerp_(self._averages, self._weights, POLYAK)
 
 
 TRANSITION = np.dtype(
@@ -97,10 +175,8 @@ continues."""
 class _Games:
     """Games that are played at once, and the transitions of all games so far."""
 
-    def __init__(
-        self, game: Game, rng: np.random.Generator, settings: DdqnSettings, *, sees_svo: bool
-    ) -> None:
-        self.game, self.rng, self.midway, self.sees_svo = game, rng, settings.midway, sees_svo
+    def __init__(self, game: Game, rng: np.random.Generator, settings: DdqnSettings) -> None:
+        self.game, self.rng, self.midway = game, rng, settings.midway
         self.transitions = np.zeros(settings.transitions, TRANSITION)
         self.filled = 0
         self.state = np.zeros((GAMES, 4))
@@ -109,20 +185,16 @@ class _Games:
         self.ended: list[float] = []
         self._begin(np.arange(GAMES))
 
-    @property
-    def full(self) -> bool:
-        return self.filled == len(self.transitions)
-
     def _begin(self, which: IntArray) -> None:
         n, scenario = len(which), self.game.scenario
         self.state[which] = exploring_starts(n, self.rng, self.midway, scenario=scenario)
-        self.svo_rad[which] = self.rng.uniform(SVO.low, SVO.high, n) * self.sees_svo
+        self.svo_rad[which] = self.rng.uniform(SVO.low, SVO.high, n) * self.game.sees_svo
         self.decisions[which] = 0
         self.returns[which] = 0.0
 
     def play(self, online: nn.Sequential, epsilon: float) -> None:
         """Take one decision in every game, a random one with probability epsilon."""
-        psi = self.svo_rad if self.sees_svo else None
+        psi = self.svo_rad if self.game.sees_svo else None
         before = features(self.state.T, psi, scenario=self.game.of_agent)
         with torch.no_grad():
             action = online(torch.from_numpy(before.astype(np.float32))).argmax(-1).numpy()
@@ -144,30 +216,27 @@ class _Games:
             self.ended += self.returns[again].tolist()
             self._begin(again)
 
-    def loss(self, online: nn.Sequential, target: nn.Sequential, batch: int) -> Tensor:
-        """Return the loss of the online network on some transitions.
+    def loss(self, learner: Learner, batch: int) -> Tensor:
+        """Return the loss of the learning network on `batch` transitions, drawn at random.
 
-        Args:
-            online: the network that learns.
-            target: the network that rates the best next action.
-            batch: number of transitions.
+        The average network is the target network.
         """
         rows = self.transitions[self.rng.integers(0, self.filled, batch)]
         before, after = rows["before"], rows["after"]
         svo_rad: np.ndarray = np.zeros(batch, dtype=np.float32)
-        if self.sees_svo:
+        if self.game.sees_svo:
             svo_rad = self.rng.uniform(SVO.low, SVO.high, batch).astype(np.float32)
-            columns = np.cos(svo_rad) * 2.0 - 1.0, np.sin(svo_rad) * 2.0 - 1.0
+            columns = svo_features(svo_rad)
             before, after = np.column_stack([before, *columns]), np.column_stack([after, *columns])
         reward = RewardParts(*rows["parts"].T).of(self.game.role, svo_rad)
         inputs = torch.from_numpy(np.ascontiguousarray(after))
         with torch.no_grad():
-            # Double: the online network picks the action, the target network rates it.
-            picked = online(inputs).argmax(-1, keepdim=True)
-            rated = unsquash(target(inputs).gather(1, picked)[:, 0])
+            # Double: the learning network picks the action, the target network rates it.
+            picked = learner.network(inputs).argmax(-1, keepdim=True)
+            rated = unsquash(learner.average(inputs).gather(1, picked)[:, 0])
             goal = squash(torch.from_numpy(reward) + torch.from_numpy(rows["continues"]) * rated)
         action = torch.from_numpy(rows["action"])[:, None]
-        q = online(torch.from_numpy(np.ascontiguousarray(before))).gather(1, action)[:, 0]
+        q = learner.network(torch.from_numpy(np.ascontiguousarray(before))).gather(1, action)[:, 0]
         return nn.functional.smooth_l1_loss(q, goal)
 
 
@@ -175,42 +244,39 @@ def train(
     game: Game,
     seed: int,
     settings: DdqnSettings | None = None,
-    *,
-    sees_svo: bool = False,
     on_progress: Callable[[TrainingProgress], None] = lambda _: None,
 ) -> QNetwork:
-    """Train the agent of a game and return its network; same seed, same weights.
+    """Train the agent of a game; same seed, same weights.
 
     Args:
         game: the game.
         seed: seed of the weights and of the games.
-        settings: by default those of the shipped policies.
-        sees_svo: whether the network sees psi of the POV.
+        settings: settings; by default those of the shipped policies.
         on_progress: called after every thousand updates.
+
+    Returns:
+        The network of the agent.
     """
     s = settings or DdqnSettings()
     # One thread: the result must not depend on the number of cores.
     torch.set_num_threads(1)
     torch.manual_seed(seed)
-    inputs = FEATURES + SVO_FEATURES * sees_svo
-    online, target = make_network(inputs, s.width), make_network(inputs, s.width)
-    target.load_state_dict(online.state_dict())
-    optimiser = torch.optim.Adam(online.parameters(), lr=s.learning_rate, fused=True)
-    games = _Games(game, np.random.default_rng(seed), s, sees_svo=sees_svo)
+    learner = Learner(make_network(FEATURES + SVO_FEATURES * game.sees_svo, s.width))
+    games = _Games(game, np.random.default_rng(seed), s)
     update = 0
     while update < s.updates:
-        if not games.full:
+        is_full = games.filled == s.transitions
+        if not is_full:
             explored = min(2.0 * games.filled / s.transitions, 1.0)
-            games.play(online, s.exploration + explored * (s.last_exploration - s.exploration))
+            epsilon = s.exploration + explored * (s.last_exploration - s.exploration)
+            games.play(learner.network, epsilon)
         share = (games.filled - s.warm_up) / (s.transitions - s.warm_up)
-        due = s.updates if games.full else int(s.updates * s.collecting * share)
+        due = s.updates if is_full else int(s.updates * s.collecting * share)
         while update < due:
             cosine = 0.5 * (1.0 + math.cos(math.pi * update / s.updates))
             rate = s.last_learning_rate + (s.learning_rate - s.last_learning_rate) * cosine
-            for group in optimiser.param_groups:
-                group["lr"] = rate * min(1.0, (update + 1) / 500)
-            loss = games.loss(online, target, s.batch)
-            descend(optimiser, loss, online, target, s.gradient_norm)
+            loss = games.loss(learner, s.batch)
+            learner.descend(loss, rate * min(1.0, (update + 1) / 500), s.gradient_norm)
             update += 1
             if update % 1000 == 0:
                 progress = TrainingProgress(
@@ -220,37 +286,16 @@ def train(
                     mean_return=float(np.mean(games.ended[-2000:])),
                 )
                 on_progress(progress)
-    return export(target, game.a_min_mps2)
-
-
-def descend(
-    optimiser: torch.optim.Adam,
-    loss: Tensor,
-    network: nn.Sequential,
-    average: nn.Sequential,
-    gradient_norm: float,
-) -> None:
-    """Take one gradient step.
-
-    Args:
-        optimiser: optimiser of the weights of the network.
-        loss: the loss.
-        network: the network.
-        average: network with the average of the weights.
-        gradient_norm: bound to which the gradient is clipped.
-    """
-    weights: list[Tensor] = list(network.parameters())
-    averages: list[Tensor] = list(average.parameters())
-    optimiser.zero_grad()
-    loss.backward()  # type: ignore[no-untyped-call]
-    nn.utils.clip_grad_norm_(weights, gradient_norm)
-    optimiser.step()
-    with torch.no_grad():
-        torch._foreach_lerp_(averages, weights, POLYAK)
+    return export(learner.average, game.a_min_mps2)
 
 
 def make_network(inputs: int, width: int) -> nn.Sequential:
-    """Return a network with two hidden layers and random weights."""
+    """Return a network with two hidden layers and random weights.
+
+    Args:
+        inputs: number of inputs.
+        width: units of each hidden layer.
+    """
     return nn.Sequential(
         nn.Linear(inputs, width),
         nn.ReLU(),
@@ -261,13 +306,22 @@ def make_network(inputs: int, width: int) -> nn.Sequential:
 
 
 def export(network: nn.Sequential, a_min_mps2: float | None = None) -> QNetwork:
-    """Return a torch network as one that acts in numpy, with its limit of braking."""
+    """Return a torch network as one that acts in numpy.
+
+    Args:
+        network: the network, of linear layers with rectified units between them.
+        a_min_mps2: hardest braking of its driver; None for that of the scenario.
+    """
     arrays = [parameter.detach().numpy().copy() for parameter in network.parameters()]
     return QNetwork(list(zip(arrays[::2], arrays[1::2], strict=True)), a_min_mps2)
 
 
 def as_torch(network: QNetwork) -> nn.Sequential:
-    """Return a network as one that torch trains, in float32; the inverse of `export`."""
+    """Return a network as one that torch trains, in float32; the inverse of `export`.
+
+    Args:
+        network: a network with two hidden layers.
+    """
     width, inputs = network.layers[0][0].shape
     model = make_network(inputs, width)
     with torch.no_grad():

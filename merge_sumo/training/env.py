@@ -12,7 +12,6 @@ actions 0 to 6 are accelerations of -4 to +2 m/s2. `scenario=` plays another sce
 
 from __future__ import annotations
 
-import math
 from typing import Any, Literal
 
 import gymnasium
@@ -43,6 +42,13 @@ class MergeEnv(gymnasium.Env[FloatArray, np.int64]):
         game = MergeEnv("vut")
         observation, _ = game.reset(seed=1)
         observation, reward, terminated, truncated, _ = game.step(5)
+
+    Attributes:
+        game: the game by eq. (4).
+        svo: psi of a POV of level 2, in rad, "random", or None.
+        render_mode: "rgb_array", or None for no pictures.
+        observation_space: bounds of [x_POV, v_POV, x_VUT, v_VUT], and of psi unless `svo` is None.
+        action_space: indices of `game.actions_mps2`.
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": FPS}  # noqa: RUF012
@@ -82,10 +88,6 @@ class MergeEnv(gymnasium.Env[FloatArray, np.int64]):
         is_psi = isinstance(svo, int | float) and SVO.low <= svo < SVO.high
         if not (svo is None or svo == "random" or is_psi):
             raise UserError(f"svo is {svo!r}: choose 'random', or 0 up to, and below, pi/2")
-        if render_mode not in (None, "rgb_array"):
-            raise UserError(
-                f"there is no render_mode {render_mode!r}: choose 'rgb_array', or leave it out"
-            )
         network = None if opponent == "level0" else load_network(opponent)
         reward = Reward(weights or RewardWeights.of(scenario), of_two(scenario))
         self.game = Game(role, network, reward)
@@ -98,14 +100,23 @@ class MergeEnv(gymnasium.Env[FloatArray, np.int64]):
         self._bounds = low, high
         self.observation_space = spaces.Box(low, high, dtype=np.float64)
         self.action_space = spaces.Discrete(ACTIONS)
-        self._most_decisions = math.ceil(scenario.max_steps / DECISION_STEPS)
         self._state, self._svo_rad, self._decisions = np.zeros((1, 4)), np.zeros(1), 0
-        self._picture = None if render_mode is None else GamePicture(self.game.scenario)
+        self._picture = None
+        if render_mode == "rgb_array":
+            self._picture = GamePicture(self.game.scenario)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[FloatArray, dict[str, Any]]:
-        """Begin a game from a start of the pool."""
+        """Begin a game from a start of the pool.
+
+        Args:
+            seed: seed of the starts of this and the next games; None continues with the last one.
+            options: not used.
+
+        Returns:
+            The observation, (4,) or (5,), and no further information.
+        """
         super().reset(seed=seed)
         self._state = pool_starts(1, self.np_random, self.game.scenario)
         if self.svo == "random":
@@ -118,6 +129,13 @@ class MergeEnv(gymnasium.Env[FloatArray, np.int64]):
     def step(self, action: np.int64) -> tuple[FloatArray, float, bool, bool, dict[str, Any]]:
         """Take one decision.
 
+        Args:
+            action: index of an acceleration, 0 to 6.
+
+        Returns:
+            The observation, the reward, whether the VUT has reached M, whether the game is cut off
+            by the timeout of the scenario, and no further information.
+
         Raises:
             UserError: if it is not an action.
         """
@@ -128,7 +146,7 @@ class MergeEnv(gymnasium.Env[FloatArray, np.int64]):
         a_mps2 = self.game.actions_mps2[[action]]
         self._state, reward, over = self.game.advance(self._state, self._svo_rad, a_mps2)
         self._decisions += 1
-        truncated = not over[0] and self._decisions >= self._most_decisions
+        truncated = not over[0] and self._decisions >= self.game.max_decisions
         return self._observed(), float(reward[0]), bool(over[0]), truncated, {}
 
     def render(self) -> NDArray[np.uint8] | None:

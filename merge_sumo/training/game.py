@@ -26,7 +26,11 @@ IntArray = NDArray[np.int64]
 
 
 def of_two(scenario: Scenario) -> Scenario:
-    """Return a scenario of a POV and a VUT alone, with perfect sensors and actuators."""
+    """Return a scenario of a POV and a VUT alone, with perfect sensors and actuators.
+
+    Args:
+        scenario: a scenario, possibly with more cars and imperfect sensors and actuators.
+    """
     return replace(
         scenario,
         headway_ahead_s=None,
@@ -64,6 +68,11 @@ class Game:
     def scenario(self) -> Scenario:
         """The scenario that is played."""
         return self.reward.scenario
+
+    @property
+    def sees_svo(self) -> bool:
+        """Whether the agent sees psi: as a POV whose opponent reacts, that of level 2."""
+        return self.role == "pov" and self.opponent is not None
 
     @property
     def of_agent(self) -> Scenario:
@@ -112,7 +121,8 @@ class Game:
             a_mps2: accelerations of the agent, (n,).
 
         Returns:
-            As `advance`.
+            The states after it, (n, 4), the parts of the rewards, and whether each game is over,
+            (n,).
         """
         x_pov, v_pov, x_vut, v_vut = state.T.copy()
         reward, scenario = self.reward, self.scenario
@@ -123,12 +133,9 @@ class Game:
         safe, pov_ego, vut_ego = np.zeros((3, len(state)))
         live = np.ones(len(state), dtype=bool)
         for _ in range(DECISION_STEPS):
-            if self.role == "vut":
-                a_pov, a_vut = other, a_mps2
-            elif self.opponent is None:
-                a_pov, a_vut = a_mps2, level0_acceleration(v_vut, scenario)
-            else:
-                a_pov, a_vut = a_mps2, other
+            if self.role == "pov" and self.opponent is None:
+                other = level0_acceleration(v_vut, scenario)
+            a_pov, a_vut = (a_mps2, other) if self.role == "pov" else (other, a_mps2)
             pov_ego += live * reward.pov_step(v_pov, a_pov)
             vut_ego += live * reward.vut_step(v_vut, a_vut)
             x_pov = x_pov + live * v_pov * DT_S
@@ -151,14 +158,17 @@ class Game:
         first: IntArray | None = None,
         held: int = 1,
     ) -> FloatArray:
-        """Return the returns, (n,), of playing to the end.
+        """Play games to their ends.
 
         Args:
             state: states, (n, 4).
             svo_rad: psi of the POV, (n,).
             policy: chooses the actions.
-            first: actions, (n,), before those of the policy, if any.
+            first: actions before those of the policy, (n,); None for none.
             held: number of decisions for which these are held.
+
+        Returns:
+            The returns, (n,).
         """
         returns, index = np.zeros(len(state)), np.arange(len(state))
         for decision in range(self.max_decisions):
@@ -174,20 +184,27 @@ class Game:
     def action_returns(
         self, state: FloatArray, svo_rad: FloatArray, policy: Policy, held: int = 1
     ) -> FloatArray:
-        """Return the returns of each action, (n, 7), with the policy after it.
+        """Play games to their ends with each action as the first.
 
         Args:
             state: states, (n, 4).
             svo_rad: psi of the POV, (n,).
-            policy: chooses the actions after it.
-            held: number of decisions for which an action is held.
+            policy: chooses the actions after the first.
+            held: number of decisions for which the first action is held.
+
+        Returns:
+            The return of each action, (n, 7).
         """
         repeated, psi = np.repeat(state, ACTIONS, axis=0), np.repeat(svo_rad, ACTIONS)
         first = np.tile(np.arange(ACTIONS), len(state))
         return self.play(repeated, psi, policy, first, held).reshape(len(state), ACTIONS)
 
     def improved(self, policy: Policy) -> Policy:
-        """Return the policy that plays every action out before it chooses (Tesauro, 1996)."""
+        """Return the policy that plays every action out before it chooses (Tesauro, 1996).
+
+        Args:
+            policy: chooses the actions after the first.
+        """
 
         def choose(state: FloatArray, svo_rad: FloatArray) -> IntArray:
             returns = self.action_returns(state, svo_rad, policy)
@@ -197,7 +214,12 @@ class Game:
 
 
 def greedy(network: QNetwork, scenario: Scenario) -> Policy:
-    """Return the policy that takes the action of the highest Q."""
+    """Return the policy that takes the action of the highest Q.
+
+    Args:
+        network: gives Q, by products in float32.
+        scenario: the scenario that is played.
+    """
 
     def choose(state: FloatArray, svo_rad: FloatArray) -> IntArray:
         inputs = inputs_of(network, state, svo_rad, scenario)
@@ -209,25 +231,31 @@ def greedy(network: QNetwork, scenario: Scenario) -> Policy:
 def inputs_of(
     network: QNetwork, state: FloatArray, svo_rad: FloatArray, scenario: Scenario
 ) -> FloatArray:
-    """Return the inputs of a network, (n, features).
+    """Compute the inputs of a network.
 
     Args:
         network: the network.
         state: states, (n, 4).
         svo_rad: psi of the POV, (n,), which not every network sees.
         scenario: the scenario that is played.
+
+    Returns:
+        The inputs, (n, 26), or (n, 28) for a network that sees psi.
     """
     psi = svo_rad if network.sees_svo else None
     return features(state.T, psi, scenario=network.limited(scenario))
 
 
 def pool_starts(n: int, rng: np.random.Generator, scenario: Scenario) -> FloatArray:
-    """Return starting states, (n, 4), uniform over the pool.
+    """Draw starting states, uniform over the pool.
 
     Args:
-        n: their number.
+        n: number of states.
         rng: source of random numbers.
         scenario: the scenario of the pool.
+
+    Returns:
+        The states, (n, 4).
     """
     x_pov = rng.uniform(*scenario.x_pov0_m, n)
     v_pov = rng.uniform(*scenario.v_pov0_mps, n)
@@ -243,7 +271,7 @@ def _starting_speeds(n: int, rng: np.random.Generator, scenario: Scenario) -> Fl
 def exploring_starts(
     n: int, rng: np.random.Generator, midway: float = 0.6, *, scenario: Scenario
 ) -> FloatArray:
-    """Return `n` starting states, (n, 4): a share from mid-way in a game, the rest of the pool.
+    """Draw starting states: a share from mid-way in a game, the rest from the pool.
 
     Mid-way, both vehicles would mostly reach M together, because a small error of Q is a collision
     there. Some states are anywhere, because a black-box VUT leads the drivers to them.
@@ -253,6 +281,9 @@ def exploring_starts(
         rng: source of random numbers.
         midway: share of states from mid-way in a game.
         scenario: the scenario that is played.
+
+    Returns:
+        The states, (n, 4).
     """
     unit, wide_gap = Units.of(scenario), RewardWeights.of(scenario).gap_full_m / 60.0
     speed, x_vut0 = unit.speed, scenario.x_vut0_m

@@ -25,7 +25,6 @@ from merge_sumo.drivers.levelk import LIMIT, QNetwork
 from merge_sumo.drivers.policies import (
     MANIFEST,
     NETWORKS,
-    load_network,
     plays_as,
     policies_of,
     read_manifest,
@@ -40,11 +39,11 @@ from merge_sumo.result import Result
 from merge_sumo.road.loader import road_for
 from merge_sumo.scenario.scenario import US23, Scenario
 from merge_sumo.spawning import forget_safe_path, without_cwd, without_main
-from merge_sumo.training.check import CHECK_CASES, OPPONENTS, PolicyCheck, check_policy
+from merge_sumo.training.check import OPPONENTS, PolicyCheck, check_policy, game_of
 from merge_sumo.training.ddqn import DdqnSettings, TrainingProgress, train
 from merge_sumo.training.game import Game, of_two
 from merge_sumo.training.refine import RefineSettings, refine
-from merge_sumo.training.reward import Reward, RewardWeights
+from merge_sumo.training.reward import RewardWeights
 from merge_sumo.workers import leave_signals_to_parent
 
 PAIRS: tuple[tuple[str, ...], ...] = (NETWORKS[:2], NETWORKS[2:])
@@ -59,7 +58,7 @@ class TrainingSettings:
 
     ddqn: DdqnSettings = field(default_factory=DdqnSettings)
     refine: RefineSettings = field(default_factory=RefineSettings)
-    check_cases: int = CHECK_CASES
+    check_cases: int = 300
 
 
 LEVEL_SETTINGS = {
@@ -77,8 +76,6 @@ def train_library(
     folder: Path,
     names: tuple[str, ...] = NETWORKS,
     seed: int = 0,
-    weights: RewardWeights | None = None,
-    settings: TrainingSettings | None = None,
     *,
     scenario: Scenario,
     a_min_mps2: float | None = None,
@@ -89,14 +86,12 @@ def train_library(
 
     A network that the manifest of the folder already has with the same scenario, seed, weights,
     settings and opponent is not trained again, so an interrupted training continues with the
-    others. Each network has a log next to it, `NAME.training.jsonl`.
+    others. Each network has a log, `NAME.training.jsonl`.
 
     Args:
         folder: folder of the networks and their manifest.
         names: networks that are trained.
         seed: seed of every network.
-        weights: weights of the reward; by default those of the scenario.
-        settings: settings of every network; by default those of its level.
         scenario: the scenario that is played.
         a_min_mps2: hardest braking of the POVs; the VUTs keep the limit of the scenario.
         on_progress: called with the progress of each network.
@@ -113,44 +108,37 @@ def train_library(
             f"the hardest braking of a POV is {a_min_mps2:g} m/s2: choose a number from "
             f"{scenario.a_min_mps2:g} to below 0, such as `a_min` {scenario.a_min_mps2 / 2:g}"
         )
-    reward = Reward(weights or RewardWeights.of(scenario), scenario)
     road_for(scenario)  # the check needs it in the end
-    _take(folder)
+    _make_library(folder)
     for level, pair in enumerate(PAIRS, start=1):
-        of_level = settings or LEVEL_SETTINGS[level]
-        plans = {}
+        settings = LEVEL_SETTINGS[level]
+        plans: dict[str, dict[str, Any]] = {}
+        games: dict[str, Game] = {}
         for name in pair:
-            if name in names:
-                plans[name] = _plan(folder, name, seed, reward, of_level, a_min_mps2)
-        tasks: dict[str, _Task] = {}
-        for name, plan in plans.items():
-            known = read_manifest(folder).get(name)
-            if known is None:
-                opponent = plan["opponent"]
-                network = None if opponent == "level0" else load_network(opponent, folder)
-                game = Game(plan["role"], network, reward, plan[LIMIT])
-                tasks[name] = game, seed, of_level
-            elif not _follows(known, plan):
+            if name not in names:
+                continue
+            plan = plans[name] = _plan(folder, name, seed, scenario, settings, a_min_mps2)
+            trained = read_manifest(folder).get(name)
+            if trained is None:
+                games[name] = game_of(name, folder, scenario, plan[LIMIT])
+            elif not _follows(trained, plan):
                 raise UserError(
                     f"{folder} has a {name} of another scenario, seed, opponent or setting: "
                     "choose another folder with `out`, or remove it first"
                 )
-        for name, network, seconds in _train_in_parallel(folder, tasks, on_progress):
-            _keep(folder, name, network, {**plans[name], "training_s": round(seconds, 1)})
-        for name, entry in read_manifest(folder).items():
-            if name not in plans:
-                continue
+        _train_in_parallel(folder, games, plans, settings, on_progress)
+        for name in plans:
+            entry = read_manifest(folder)[name]
             if "check" in entry:
                 say(f"{name} is there already")
                 continue
-            count = of_level.check_cases
-            check = check_policy(name, folder, count, scenario=scenario, weights=reward.weights)
+            check = check_policy(name, folder, settings.check_cases, scenario)
             _write_entry(folder, name, {**entry, "check": to_plain(check)})
             say(f"{name} is ready")
 
 
-def _take(folder: Path) -> None:
-    """Create a folder of policies with an empty manifest.
+def _make_library(folder: Path) -> None:
+    """Create a folder of policies with an empty manifest; keep an existing one.
 
     Raises:
         UserError: if the folder has other contents and no manifest.
@@ -171,24 +159,23 @@ def _take(folder: Path) -> None:
     write_new(manifest, to_json({"networks": {}}, indent=2))
 
 
-def _follows(known: dict[str, Any], plan: dict[str, Any]) -> bool:
-    """Return whether the entry of a manifest follows a plan."""
-    compared = {key: known.get(key) for key in plan}
-    compared["scenario"] = plan["scenario"]
-    return compared == plan and plays_as(scenario_of(known), scenario_of(plan))
+def _follows(entry: dict[str, Any], plan: dict[str, Any]) -> bool:
+    """Return whether the entry of a manifest follows a plan; names of scenarios may differ."""
+    same = all(entry.get(key) == plan[key] for key in plan if key != "scenario")
+    return same and plays_as(scenario_of(entry), scenario_of(plan))
 
 
 def _plan(
     folder: Path,
     name: str,
     seed: int,
-    reward: Reward,
+    scenario: Scenario,
     settings: TrainingSettings,
     a_min_mps2: float | None,
 ) -> dict[str, Any]:
     """Return everything that decides the weights of a network."""
     role, opponent = OPPONENTS[name]
-    scenario, command = reward.scenario, f"merge-sumo train --only {name} --seed {seed}"
+    command = f"merge-sumo train --only {name} --seed {seed}"
     if not plays_as(scenario, US23):
         command += f" --scenario {quoted(scenario.name)}"
     if a_min_mps2 is not None:
@@ -211,35 +198,33 @@ def _plan(
         "opponent": opponent,
         "opponent_sha256": opponent_sha256,
         "seed": seed,
-        "reward_weights": to_plain(reward.weights),
+        "reward_weights": to_plain(RewardWeights.of(scenario)),
         "settings": to_plain(settings),
         LIMIT: a_min_mps2 if role == "pov" else None,
     }
 
 
-_Task = tuple[Game, int, TrainingSettings]
-"""Game, seed and settings of a network, for the process that trains it."""
-_Trained = tuple[str, QNetwork, float]
-"""Name, network, and the seconds of the training."""
-
-
 def _train_in_parallel(
-    folder: Path, tasks: dict[str, _Task], on_progress: Callable[[TrainingProgress], None]
-) -> list[_Trained]:
-    """Train networks in a process each; write their logs while they train.
+    folder: Path,
+    games: dict[str, Game],
+    plans: dict[str, dict[str, Any]],
+    settings: TrainingSettings,
+    on_progress: Callable[[TrainingProgress], None],
+) -> None:
+    """Train a network for each game, in a process each; write their logs and the networks.
 
     Raises:
-        UserError: if the log cannot be written, or a process ends before its network is trained.
+        UserError: if a file cannot be written, or a process ends before its network is trained.
     """
     # Spawned, because libsumo's simulation must not be forked.
     context = get_context("spawn")
-    trained: list[_Trained] = []
     names: dict[Connection, str] = {}
-    logs = dict.fromkeys(tasks, b"")
+    logs = dict.fromkeys(games, b"")
     with ExitStack() as opened:
-        for name, task in tasks.items():
+        for name, game in games.items():
             receiver, sender = context.Pipe(duplex=False)
-            process = context.Process(target=_train_one, args=(sender, name, *task))
+            task = sender, game, plans[name]["seed"], settings
+            process = context.Process(target=_train_one, args=task)
             with without_main(), without_cwd():
                 process.start()
             # An interrupted training does not wait for the hour that a process still needs.
@@ -257,29 +242,24 @@ def _train_in_parallel(
                         "command again"
                     ) from error
                 if isinstance(message, TrainingProgress):
-                    logs[name] += to_json(message)
+                    progress = replace(message, network=name)
+                    logs[name] += to_json(progress)
                     replace_own(folder / f"{name}{LOG}", logs[name])
-                    on_progress(message)
+                    on_progress(progress)
                 else:
-                    trained.append(message)
+                    network, seconds = message
+                    _keep(folder, name, network, {**plans[name], "training_s": round(seconds, 1)})
                     del names[receiver]
-    return trained
 
 
-def _train_one(
-    sender: Connection, name: str, game: Game, seed: int, settings: TrainingSettings
-) -> None:
+def _train_one(sender: Connection, game: Game, seed: int, settings: TrainingSettings) -> None:
     """Train a network by DDQN and refine it; send the progress, then the result."""
     forget_safe_path()
     leave_signals_to_parent()
-
-    def report(progress: TrainingProgress) -> None:
-        sender.send(replace(progress, network=name))
-
     started = time.perf_counter()
-    network = train(game, seed, settings.ddqn, sees_svo=name == "pov2", on_progress=report)
-    network = refine(game, network, seed, settings.refine, report)
-    sender.send((name, network, time.perf_counter() - started))
+    network = train(game, seed, settings.ddqn, sender.send)
+    network = refine(game, network, seed, settings.refine, sender.send)
+    sender.send((network, time.perf_counter() - started))
 
 
 def _keep(folder: Path, name: str, network: QNetwork, entry: dict[str, Any]) -> None:
@@ -377,7 +357,7 @@ def train_and_check(
     checks = PolicyChecks()
     for name in names:
         if settings.check:
-            checks[name] = check_policy(name, folder, settings.cases, scenario=played)
+            checks[name] = check_policy(name, folder, settings.cases, played)
         else:
             checks[name] = PolicyCheck(**manifest[name]["check"])
     return checks

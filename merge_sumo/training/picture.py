@@ -1,8 +1,9 @@
-"""A merging game from above, to scale, drawn by pygame."""
+"""Pictures of a merging game, seen from above and drawn to scale by pygame."""
 
 from __future__ import annotations
 
 import importlib
+import math
 from typing import Any
 
 import numpy as np
@@ -16,14 +17,21 @@ from merge_sumo.scenario.scenario import COLOURS, Scenario
 
 ROAD = "#c9c7c1"
 INK = "#1c2228"
-SIZE_PX = (960, 240)
+SIZE_PX = np.array([960, 240])
 LANE_M = 3.05
 """Drawn width of a lane of 3.2 m: the rest is the line between two lanes."""
 CAR_M = 2.0
+"""Width of a car."""
+MARGINS_M = (50.0, 22.5)
+"""Width and height of the picture, in addition to the distance between the cars."""
+LABEL_PX = 26.0
+"""Distance from the centre of a car to that of its label."""
+MERGE_LINE = np.array([[0.0, -2.4], [0.0, 5.4]])
+"""Ends of the line across the road at M, (2, 2), in m."""
 
 
 class GamePicture:
-    """Draws states of a game on the road of its scenario.
+    """Draws states of a merging game on the road of its scenario.
 
     Example:
         picture = GamePicture(US23)
@@ -31,7 +39,10 @@ class GamePicture:
     """
 
     def __init__(self, scenario: Scenario) -> None:
-        """Take the road of a scenario.
+        """Load the road of a scenario.
+
+        Args:
+            scenario: the scenario of the game.
 
         Raises:
             UserError: if pygame is not installed.
@@ -40,49 +51,65 @@ class GamePicture:
             self._pygame: Any = importlib.import_module("pygame")
         except ImportError as error:
             raise UserError("pictures need pygame: pip install 'merge-sumo[train]'") from error
+        self._pygame.font.init()
         self._road = road_data(road_for(scenario))
         self._lengths_m = scenario.lengths_m
-        self._pygame.font.init()
-        self._font = self._pygame.font.Font(None, 22)
 
     def frame(self, state: FloatArray) -> NDArray[np.uint8]:
-        """Return the picture of a state, [x_POV, v_POV, x_VUT, v_VUT], as (height, width, 3)."""
-        canvas = self._pygame.Surface(SIZE_PX)
-        canvas.fill("#ffffff")
-        cars = {}
-        for row, (who, path) in enumerate((("pov", "main"), ("vut", "ramp"))):
-            along_m, x, y = np.array(self._road[path]).T
-            front_m = state[2 * row]
-            ends_m = [front_m - self._lengths_m[row], front_m]
-            cars[who] = np.column_stack(
-                [np.interp(ends_m, along_m, x), np.interp(ends_m, along_m, y)]
-            )
-        fronts = np.array([car[1] for car in cars.values()])
-        across_m, up_m = np.ptp(fronts, axis=0)
-        width, height = SIZE_PX
-        width_m = max(across_m + 50.0, (1.7 * up_m + 22.0) * width / height, 90.0)
-        scale = width / width_m
-        centre = (fronts.min(axis=0) + fronts.max(axis=0)) / 2.0
+        """Draw one state.
 
-        def draw(colour: str, points: FloatArray, line_m: float) -> FloatArray:
-            """Draw a line on the road; return its points in pixels.
+        Args:
+            state: x_POV, v_POV, x_VUT and v_VUT, (4,), in m and m/s.
 
-            Args:
-                colour: #RRGGBB.
-                points: in m, (n, 2).
-                line_m: width of the line.
-            """
-            pixels: FloatArray = np.array(SIZE_PX) / 2.0 + (points - centre) * [scale, -scale]
-            self._pygame.draw.lines(canvas, colour, False, pixels, max(round(line_m * scale), 1))
-            return pixels
-
+        Returns:
+            Red, green and blue of each pixel, (240, 960, 3).
+        """
+        x_pov_m, v_pov_mps, x_vut_m, v_vut_mps = state
+        pov_length_m, vut_length_m = self._lengths_m
+        pov = self._car("main", x_pov_m - pov_length_m, x_pov_m)
+        vut = self._car("ramp", x_vut_m - vut_length_m, x_vut_m)
+        canvas = _Canvas(self._pygame, pov[1], vut[1])
         for lane in self._road["lanes"]:
-            draw(ROAD, np.array(lane), LANE_M)
-        draw(INK, np.array([[0.0, -2.4], [0.0, 5.4]]), 0.25)
-        for row, (who, car) in enumerate(cars.items()):
-            x, y = draw(COLOURS[who], car, CAR_M).mean(axis=0)
-            text = self._font.render(f"{who.upper()} {state[2 * row + 1]:.1f} m/s", True, INK)
-            side = 2 * row - 1
-            place = text.get_rect(center=(x, y + side * (2.4 * scale + 11.0)))
-            canvas.blit(text, place.clamp(canvas.get_rect()))
-        return np.ascontiguousarray(self._pygame.surfarray.array3d(canvas).transpose(1, 0, 2))
+            canvas.draw_line(ROAD, np.array(lane), LANE_M)
+        canvas.draw_line(INK, MERGE_LINE, 0.25)
+        canvas.draw_car("pov", pov, v_pov_mps, -LABEL_PX)
+        canvas.draw_car("vut", vut, v_vut_mps, LABEL_PX)
+        columns = self._pygame.surfarray.array3d(canvas.surface)
+        return np.ascontiguousarray(columns.transpose(1, 0, 2))
+
+    def _car(self, path: str, rear_m: float, front_m: float) -> FloatArray:
+        """Return the points of the rear and the front of a car on a path of the road, (2, 2)."""
+        along_m, x_m, y_m = np.array(self._road[path]).T
+        ends_m = rear_m, front_m
+        return np.column_stack([np.interp(ends_m, along_m, x_m), np.interp(ends_m, along_m, y_m)])
+
+
+class _Canvas:
+    """A surface of pygame that shows both cars, with coordinates in m: x to the right, y up."""
+
+    def __init__(self, pygame: Any, pov_front_m: FloatArray, vut_front_m: FloatArray) -> None:
+        self._pygame = pygame
+        self.surface = pygame.Surface(SIZE_PX)
+        self.surface.fill("#ffffff")
+        shown_m = np.abs(pov_front_m - vut_front_m) + MARGINS_M
+        self._px_per_m = (SIZE_PX / shown_m).min()
+        self._centre_m = (pov_front_m + vut_front_m) / 2.0
+
+    def draw_line(self, colour: str, points_m: FloatArray, width_m: float) -> None:
+        """Draw a line through points, (n, 2)."""
+        width_px = math.ceil(width_m * self._px_per_m)
+        self._pygame.draw.lines(self.surface, colour, False, self._pixels(points_m), width_px)
+
+    def draw_car(self, name: str, ends_m: FloatArray, v_mps: float, down_px: float) -> None:
+        """Draw a car from its rear to its front, (2, 2), and its speed as a label below it."""
+        self.draw_line(COLOURS[name], ends_m, CAR_M)
+        font = self._pygame.font.Font(None, 22)
+        text = font.render(f"{name.upper()} {v_mps:.1f} m/s", True, INK)
+        x_px, y_px = self._pixels(ends_m).mean(axis=0)
+        label = text.get_rect(center=(x_px, y_px + down_px))
+        self.surface.blit(text, label.clamp(self.surface.get_rect()))
+
+    def _pixels(self, points_m: FloatArray) -> FloatArray:
+        """Return points in pixels, which count from the upper left corner."""
+        from_centre_px = (points_m - self._centre_m) * self._px_per_m
+        return np.asarray(SIZE_PX / 2.0 + from_centre_px * [1.0, -1.0])

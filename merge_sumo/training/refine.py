@@ -33,7 +33,7 @@ from merge_sumo.drivers.levelk import ACTIONS, QNetwork
 from merge_sumo.scenario.case import FloatArray
 from merge_sumo.scenario.scenario import SVO
 from merge_sumo.training.best_response import beam_search
-from merge_sumo.training.ddqn import TrainingProgress, as_torch, descend, export, squash
+from merge_sumo.training.ddqn import Learner, TrainingProgress, as_torch, export, squash
 from merge_sumo.training.game import Game, IntArray, exploring_starts, greedy, inputs_of
 
 BETTER = 1e-3
@@ -44,36 +44,45 @@ COST_CAP = 1.0
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class RefineSettings:
-    """Settings of `refine`."""
+    """Settings of `refine`.
 
-    rounds: int = 16  # of policy iteration
-    starts: int = 1_500  # games per round
-    midway: float = 0.25  # share of them that begin mid-way (`game.exploring_starts`)
-    searched: int = 300  # starts from which a better game is searched for
-    hard: float = 0.5  # share of these that are near starts where the last search found most
-    near: float = 0.02  # how near, in standard deviations of the starts
-    beam: int = 32  # width of that search
-    exploration: float = 0.2  # share of random actions in a second game from every second start
-    unsure: float = 0.05  # lead of the best Q below which a state is always labelled
-    sure_share: float = 0.15  # share of the other states that are labelled
-    held: int = 2  # most decisions for which an action is held before the policy follows
-    kept_rounds: int = 8  # rounds whose states are trained on
-    updates: int = 2_500  # gradient steps per round
-    batch: int = 512  # states per update
-    learning_rate: float = 8e-4  # at the start; falls to 2 % of it along a cosine
-    temperature: float = 0.01  # of the softmax by which the cost of a choice is made differentiable
-    value_share: float = 0.1  # weight of the fit of Q next to the cost of the choice
+    Attributes:
+        rounds: rounds of policy iteration.
+        starts: games per round.
+        midway: share of games that begin mid-way (`game.exploring_starts`).
+        searched: starts from which a better game is searched for.
+        hard: share of these that are near starts where the last search gained most.
+        near: distance to those starts, in standard deviations of the starts.
+        beam: width of the search.
+        exploration: share of random actions in a second game from every second start.
+        unsure: lead of the best Q below which a state is always labelled.
+        sure_share: share of the other states that are labelled.
+        held: most decisions for which an action is held before the policy follows.
+        kept_rounds: rounds whose states are trained on.
+        updates: gradient steps per round.
+        batch: states per update.
+        learning_rate: learning rate at the start; it falls to 2 % of it along a cosine.
+        temperature: temperature of the softmax that makes the cost of a choice differentiable.
+        value_share: weight of the fit of Q; the cost of the choice has weight 1.
+    """
 
-
-@dataclass(frozen=True, slots=True)
-class _Starts:
-    """Starts of games: states, (n, 4), and psi, (n,)."""
-
-    state: FloatArray
-    svo_rad: FloatArray
-
-    def __getitem__(self, which: slice | IntArray) -> _Starts:
-        return _Starts(self.state[which], self.svo_rad[which])
+    rounds: int = 16
+    starts: int = 1_500
+    midway: float = 0.25
+    searched: int = 300
+    hard: float = 0.5
+    near: float = 0.02
+    beam: int = 32
+    exploration: float = 0.2
+    unsure: float = 0.05
+    sure_share: float = 0.15
+    held: int = 2
+    kept_rounds: int = 8
+    updates: int = 2_500
+    batch: int = 512
+    learning_rate: float = 8e-4
+    temperature: float = 0.01
+    value_share: float = 0.1
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,19 +90,19 @@ class _Tried:
     """States of the games of a round, and the actions that were tried there.
 
     Attributes:
-        at: states and psi.
+        at: states and psi, (n, 5).
         action: the actions, (n,).
         to_go: the returns from there on, (n,).
         better: whether the game was found by the search, and is better than that of the policy.
-        hard: a quarter of the searched starts: those where the search found most.
+        hard: starts, (m, 5): the quarter of the searched ones where the search gained most.
         mean_return: mean return of the policy.
     """
 
-    at: _Starts
+    at: FloatArray
     action: IntArray
     to_go: FloatArray
     better: NDArray[np.bool_]
-    hard: _Starts
+    hard: FloatArray
     mean_return: float
 
 
@@ -104,21 +113,23 @@ def refine(
     settings: RefineSettings | None = None,
     on_progress: Callable[[TrainingProgress], None] = lambda _: None,
 ) -> QNetwork:
-    """Return the network, refined for its game; same seed, same weights.
+    """Refine a network for its game; same seed, same weights.
 
     Args:
         game: the game.
         network: a network that `ddqn.train` has trained for it.
         seed: seed of starts, exploration and batches.
-        settings: by default those of level 1.
+        settings: settings; by default those of level 1.
         on_progress: called after every round.
+
+    Returns:
+        The refined network.
     """
     s = settings or RefineSettings()
     rng = np.random.default_rng([seed, 1])
-    model, average = as_torch(network), as_torch(network)
-    optimiser = torch.optim.Adam(model.parameters(), lr=s.learning_rate, fused=True)
+    learner = Learner(as_torch(network))
     rounds: list[tuple[np.ndarray, np.ndarray]] = []
-    hard: _Starts | None = None
+    hard = np.zeros((0, 5))
     # One thread: rounding must not depend on the number of cores. One limit for all rounds: where
     # it ends, the BLAS of libsumo gives torch its threads back, and they wait for each other.
     with threadpool_limits(1):
@@ -128,8 +139,8 @@ def refine(
             hard = tried.hard
             rounds = [*rounds, _label(game, network, tried, rng, s)][-s.kept_rounds :]
             inputs, returns = map(np.concatenate, zip(*rounds, strict=True))
-            cost = _fit(model, average, optimiser, inputs, returns, rng, s, number)
-            network = export(average, game.a_min_mps2)
+            cost = _fit(learner, inputs, returns, rng, s, number)
+            network = export(learner.average, game.a_min_mps2)
             progress = TrainingProgress(
                 stage="refine",
                 done=number + 1,
@@ -142,22 +153,22 @@ def refine(
 
 
 def _starts(
-    game: Game, network: QNetwork, hard: _Starts | None, rng: np.random.Generator, s: RefineSettings
-) -> _Starts:
-    """Return the starts of the games of a round; the first are near hard starts, if any."""
+    game: Game, network: QNetwork, hard: FloatArray, rng: np.random.Generator, s: RefineSettings
+) -> FloatArray:
+    """Return states and psi, (n, 5), at the starts of a round; the first are near hard starts."""
     state = exploring_starts(s.starts, rng, s.midway, scenario=game.scenario)
     svo_rad = rng.uniform(SVO.low, SVO.high, s.starts) * network.sees_svo
-    if hard is not None and len(hard.state):
-        near = hard[rng.integers(0, len(hard.state), round(s.hard * s.searched))]
-        n = len(near.state)
+    starts = np.column_stack([state, svo_rad])
+    if len(hard):
+        near = hard[rng.integers(0, len(hard), round(s.hard * s.searched))]
         # The VUT starts where it did: the state and psi of the POV make a case.
-        shift = rng.normal(size=(3, n)) * s.near
-        x_pov = near.state[:, 0] + shift[0] * state[:, 0].std()
-        v_pov = np.maximum(near.state[:, 1] + shift[1] * state[:, 1].std(), 0.0)
-        psi = near.svo_rad + shift[2] * svo_rad.std()
-        state[:n] = np.column_stack([x_pov, v_pov, near.state[:, 2:]])
-        svo_rad[:n] = psi.clip(SVO.low, SVO.high) * network.sees_svo
-    return _Starts(state, svo_rad)
+        of_pov = [0, 1, 4]
+        spread = starts.T[of_pov].std(axis=1)
+        near[:, of_pov] += rng.normal(size=(3, len(near))).T * s.near * spread
+        near[:, 1] = np.maximum(near[:, 1], 0.0)
+        near[:, 4] = near[:, 4].clip(SVO.low, SVO.high) * network.sees_svo
+        starts[: len(near)] = near
+    return starts
 
 
 def _label(
@@ -169,14 +180,14 @@ def _label(
     of games that are better than those of the policy, and a share of the others.
     """
     policy = greedy(network, game.scenario)
-    inputs = inputs_of(network, tried.at.state, tried.at.svo_rad, game.scenario)
+    inputs = inputs_of(network, tried.at[:, :4], tried.at[:, 4], game.scenario)
     second, first = np.partition(network.values_at_once(inputs), -2, axis=1)[:, -2:].T
     some = rng.random(len(inputs)) < s.sure_share
     kept = np.flatnonzero((first - second < s.unsure) | tried.better | some)
-    at = tried.at[kept]
-    returns = game.action_returns(at.state, at.svo_rad, policy)
+    state, svo_rad = tried.at[kept, :4], tried.at[kept, 4]
+    returns = game.action_returns(state, svo_rad, policy)
     for held in range(2, s.held + 1):
-        longer = game.action_returns(at.state, at.svo_rad, policy, held)
+        longer = game.action_returns(state, svo_rad, policy, held)
         returns = np.maximum(returns, longer)
     row, action = np.arange(len(kept)), tried.action[kept]
     returns[row, action] = np.maximum(returns[row, action], tried.to_go[kept])
@@ -184,15 +195,14 @@ def _label(
 
 
 def _try(
-    game: Game, network: QNetwork, starts: _Starts, rng: np.random.Generator, s: RefineSettings
+    game: Game, network: QNetwork, starts: FloatArray, rng: np.random.Generator, s: RefineSettings
 ) -> _Tried:
     """Play games by the policy, by the policy with random actions, and those of a search."""
-    n, policy = len(starts.state), greedy(network, game.scenario)
+    n, policy = len(starts), greedy(network, game.scenario)
     searched = starts[: s.searched]
-    _, plans = beam_search(game, searched.state, searched.svo_rad, network, s.beam)
-    groups = starts, starts[::2], searched
-    state = np.concatenate([group.state for group in groups])
-    psi = np.concatenate([group.svo_rad for group in groups])
+    _, plans = beam_search(game, searched[:, :4], searched[:, 4], network, s.beam)
+    played = np.concatenate([starts, starts[::2], searched])
+    state, psi = played[:, :4], played[:, 4]
     first_search = len(state) - len(plans)
     index, total = np.arange(len(state)), np.zeros(len(state))
     plan = np.full((len(state), game.max_decisions), -1)
@@ -217,7 +227,7 @@ def _try(
     most = np.argsort(-gained, kind="stable")[: len(gained) // 4]
     index, state, action, before = map(np.concatenate, zip(*steps, strict=True))
     return _Tried(
-        at=_Starts(state, psi[index]),
+        at=np.column_stack([state, psi[index]]),
         action=action,
         to_go=total[index] - before,
         better=better[index],
@@ -227,9 +237,7 @@ def _try(
 
 
 def _fit(
-    model: nn.Sequential,
-    average: nn.Sequential,
-    optimiser: torch.optim.Adam,
+    learner: Learner,
     inputs: np.ndarray,
     returns: np.ndarray,
     rng: np.random.Generator,
@@ -239,9 +247,7 @@ def _fit(
     """Train on states, and let the average of the weights follow.
 
     Args:
-        model: the network that is trained.
-        average: network with the average of the weights.
-        optimiser: optimiser of the weights of the model.
+        learner: the network that is trained, with the average of its weights.
         inputs: states as the network sees them, (n, features).
         returns: returns of the actions, (n, 7).
         rng: source of random numbers.
@@ -257,13 +263,12 @@ def _fit(
     last_costs = []
     for update in range(s.updates):
         done = (number * s.updates + update) / (s.rounds * s.updates)
-        for group in optimiser.param_groups:
-            group["lr"] = s.learning_rate * max(0.02, 0.5 * (1.0 + math.cos(math.pi * done)))
+        rate = s.learning_rate * max(0.02, 0.5 * (1.0 + math.cos(math.pi * done)))
         rows = torch.from_numpy(rng.integers(0, len(states), s.batch))
-        q = model(states[rows])
+        q = learner.network(states[rows])
         chosen = torch.softmax(q / s.temperature, dim=1)
         cost = (chosen * costs[rows]).sum(dim=1).mean()
         loss = cost + s.value_share * nn.functional.smooth_l1_loss(q, values[rows])
-        descend(optimiser, loss, model, average, 1.0)
+        learner.descend(loss, rate, 1.0)
         last_costs.append(float(cost.detach()))
     return float(np.mean(last_costs[-100:]))

@@ -19,7 +19,7 @@ from merge_sumo.campaigns.recorded import RecordedCampaign, failures
 from merge_sumo.campaigns.settings import CampaignSettings, controllers, settings_from_folder
 from merge_sumo.controllers.spec import ControllerOptions
 from merge_sumo.drivers.policies import policies_of
-from merge_sumo.drivers.reference import REFERENCES, CarefulPov
+from merge_sumo.drivers.reference_drivers import REFERENCE_DRIVERS, CarefulPov
 from merge_sumo.errors import UserError
 from merge_sumo.metrics.merge import brake_after_mps2
 from merge_sumo.road.scenario_file import named_scenario
@@ -68,7 +68,7 @@ def passes(failure, driver, until, *, in_the_povs_place=False):
 def last_of(failure):
     """Return the last of all steps at which the FSM driver may take over; None without one."""
     steps = range(len(failure.motion) - 1)
-    passing = [step for step in steps if passes(failure, REFERENCES["fsm"](1), step)]
+    passing = [step for step in steps if passes(failure, REFERENCE_DRIVERS["fsm"](1), step)]
     return max(passing, default=None)
 
 
@@ -76,7 +76,7 @@ def test_every_failure_names_who_would_have_avoided_it(run, found):
     assert [one.index for one in found] == sorted(o.index for o in failures(run.outcomes))
     for one in found[:3]:
         failure = run.trajectory(one.index)
-        names = [name for name, make in REFERENCES.items() if passes(failure, make(1), 0)]
+        names = [name for name, make in REFERENCE_DRIVERS.items() if passes(failure, make(1), 0)]
         assert list(one.avoided_by) == names
         last = last_of(failure)
         assert one.latest_takeover_s == (None if last is None else last / 10.0)
@@ -100,7 +100,7 @@ def test_on_a_lane_it_names_the_drivers_that_pass_as_the_vut(tmp_path):
     plan = settings.load_plan().with_engine("kinematic")
     failing = [o for o in run.outcomes if o.failed]
     found = avoidances(plan, [(o.index, run.trajectory(o.index)) for o in failing])
-    for name in REFERENCES:
+    for name in REFERENCE_DRIVERS:
         by_name = plan_for(name, scenario=road, criterion=plan.criterion)
         results = simulate(by_name.with_engine("kinematic"), [o.case for o in failing])
         for one, result in zip(found, results, strict=True):

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from merge_sumo.drivers.safety_models import (
+from merge_sumo.drivers.reference_models import (
     CarefulModel,
     FsmModel,
     Pair,
@@ -25,11 +25,18 @@ from merge_sumo.drivers.safety_models import (
 
 TABLES = Path(__file__).parents[1] / "data" / "reference"
 DT_S, STEPS, LENGTH_M, WIDTH_M, LANE_M = 0.1, 350, 4.3, 1.9, 3.5
+
+
+class PublishedReg157Model(Reg157Model):
+    """Looks a step ahead, as the published code does."""
+
+    bound_s = 0.45
+
+
 MODELS = {
     "CC_human_driver": CarefulModel(),
     "FSM": FsmModel(),
-    # The published code looks a step ahead.
-    "Reg157": Reg157Model(bound_s=0.45),
+    "Reg157": PublishedReg157Model(),
     "RSS": RssModel(),
 }
 

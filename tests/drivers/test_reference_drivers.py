@@ -10,15 +10,15 @@ import pytest
 from support.plans import POVS
 from support.scenes import scene_of
 
-from merge_sumo.drivers.reference import (
-    REFERENCES,
+from merge_sumo.drivers.reference_drivers import (
+    REFERENCE_DRIVERS,
     CarefulPov,
     CarefulVut,
     FsmVut,
     Reg157Vut,
     RssVut,
 )
-from merge_sumo.drivers.safety_models import FsmModel, Pair, rss_distance_m, ttc_s
+from merge_sumo.drivers.reference_models import FsmModel, Pair, rss_distance_m, ttc_s
 from merge_sumo.scenario.case import Case
 from merge_sumo.scenario.scenario import DT_S, US23, Scenario
 from merge_sumo.simulation.povs import PovLibrary
@@ -165,7 +165,7 @@ class TestTables:
 def driven(name, cases):
     """Return when merges by eq. (4) end, dx at M, and the VUT's speed there, (n,) each."""
     n = len(cases)
-    vut, pov = REFERENCES[name](n), PovLibrary(n, POVS)
+    vut, pov = REFERENCE_DRIVERS[name](n), PovLibrary(n, POVS)
     for corridor, case in enumerate(cases):
         vut.begin(corridor, case)
         pov.begin(corridor, case)

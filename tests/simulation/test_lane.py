@@ -10,8 +10,8 @@ import pytest
 from simulation.test_kinematic_simulator import uniform
 from support.plans import plan_for
 
+from merge_sumo.drivers.acceleration_lane import Merging
 from merge_sumo.drivers.base import MERGE, NO_REQUEST, STAY
-from merge_sumo.drivers.lane import Merging
 from merge_sumo.metrics.measures import Measures
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.scenario.case import Case

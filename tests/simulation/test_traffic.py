@@ -11,7 +11,7 @@ from support.plans import plan_for
 from merge_sumo.controllers.controller import seen_in
 from merge_sumo.controllers.kinds import load
 from merge_sumo.controllers.spec import ControllerOptions
-from merge_sumo.drivers.following import conflicting_car, keep_safe, safe_speed_mps
+from merge_sumo.drivers.car_following import conflicting_car, keep_safe, safe_speed_mps
 from merge_sumo.metrics.measures import Measures
 from merge_sumo.scenario.case import Case, Pool, from_unit, to_unit
 from merge_sumo.scenario.scenario import AHEAD, BEHIND, DT_S, POV, US23, Scenario

@@ -47,7 +47,6 @@ def test_anything_but_an_action_is_refused(action):
         ({"opponent": "pov1"}, "cannot play against 'pov1'"),
         ({"opponent": "vut1", "svo": "selfish"}, "svo is .*: choose 'random', or 0 up to"),
         ({"opponent": "vut1", "svo": float("nan")}, "svo is .*: choose 'random', or 0 up to"),
-        ({"render_mode": "ansi"}, "no render_mode 'ansi': choose 'rgb_array'"),
     ],
 )
 def test_wrong_settings_are_refused(settings, sentence):

@@ -270,7 +270,7 @@ class TestTraining:
     def test_a_process_that_ends_is_a_sentence(self, tmp_path, monkeypatch):
         monkeypatch.setattr(helix, "_train_one", os._exit)
         with pytest.raises(UserError, match="the process that trains pov1 has ended"):
-            train_library(tmp_path, ("pov1",), settings=SMALL, scenario=US23)
+            train_library(tmp_path, ("pov1",), scenario=US23)
         assert read_manifest(tmp_path) == {}
 
 

@@ -26,8 +26,8 @@ from merge_sumo.controllers.process import (
 )
 from merge_sumo.controllers.spec import ControllerKind, ControllerOptions, ControllerSpec
 from merge_sumo.controllers.traci.child import Child, FaultError, Reply
+from merge_sumo.drivers.acceleration_lane import speed_to_stop_mps
 from merge_sumo.drivers.base import MERGE, STAY, ControllerDiedError, Driver, Scene
-from merge_sumo.drivers.lane import speed_to_stop_mps
 from merge_sumo.errors import UserError
 from merge_sumo.files import check_code
 from merge_sumo.road.road import Road

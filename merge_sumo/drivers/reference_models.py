@@ -1,11 +1,11 @@
-"""Published models of when a careful driver brakes for a vehicle ahead, and how hard.
+"""Published models of a reference driver: when it brakes for a vehicle ahead, and how hard.
 
-They are of rear-end conflicts on one lane, for two vehicles with a gap between them: the rear one
-has to react. Parameters are those of the JRC-FSM reference implementation (European Commission,
-Joint Research Centre: ec-jrc/JRC-FSM, commit 01b05c2), which compares the models on the cut-ins of
-UN Regulation No. 157. `tests/drivers/test_cut_in.py` compares these functions with its tables.
+They describe rear-end conflicts on one lane. Of two vehicles the rear one has to react. Parameters
+are those of the JRC-FSM reference implementation (European Commission, Joint Research Centre:
+ec-jrc/JRC-FSM, commit 01b05c2), which compares the models on the cut-ins of UN Regulation No. 157.
+`tests/drivers/test_cut_in.py` compares these functions with its tables.
 
-`drivers/reference.py` applies the models to a merge.
+`drivers/reference_drivers.py` applies the models to a merge.
 """
 
 from __future__ import annotations
@@ -26,7 +26,10 @@ class Pair(NamedTuple):
     """Two vehicles on one lane, the rear one of which may have to react; arrays of shape (K,).
 
     Attributes:
-        gap_m: between the rear bumper of the front vehicle and the front bumper of the rear one.
+        gap_m: distance from the front bumper of the rear vehicle to the rear bumper of the other.
+        v_rear_mps: speed of the rear vehicle.
+        v_front_mps: speed of the front vehicle.
+        a_rear_mps2: acceleration of the rear vehicle.
     """
 
     gap_m: FloatArray
@@ -38,17 +41,22 @@ class Pair(NamedTuple):
 JERK_MPS3 = 12.65
 """Growth of the deceleration: UN R157, Annex 3, Appendix 3."""
 HARDEST_MPS2 = 0.774 * 9.81
-"""Hardest deceleration of the careful driver: the same."""
+"""Hardest deceleration of the careful driver: UN R157, Annex 3, Appendix 3."""
 
 
-class SafetyModel(ABC):
+class ReferenceModel(ABC):
     """When a driver brakes for a vehicle ahead, and how hard; arrays of shape (K,).
 
     Attributes:
         perception_steps: steps for which a risk is predicted before the delay begins.
         delay_steps: steps from the first risk to the first braking.
-        delay_s: the same as the formulas have it.
-        released_mps2: deceleration in the delay: the pedal is released.
+        delay_s: delay in the formulas.
+        released_mps2: deceleration in the delay, with the pedal released.
+        growth_mps2: growth of the deceleration in a step.
+        hardest_mps2: hardest deceleration, positive.
+
+    Example:
+        unsafe = FsmModel().is_unsafe(Pair(gap_m, v_rear_mps, v_front_mps))
     """
 
     perception_steps: int = 0
@@ -60,18 +68,30 @@ class SafetyModel(ABC):
 
     @abstractmethod
     def is_unsafe(self, pair: Pair) -> Flags:
-        """Return whether the rear vehicle is too close."""
+        """Return whether the rear vehicle is too close, (K,).
+
+        Args:
+            pair: the vehicles.
+        """
 
     def endangers(self, pair: Pair) -> Flags:
-        """Return whether the front vehicle must not get in front of the rear one like this."""
+        """Return whether the front vehicle must not get in front of the rear one like this, (K,).
+
+        Args:
+            pair: the vehicles.
+        """
         return self.is_unsafe(pair)
 
     def demand_mps2(self, pair: Pair) -> FloatArray:
-        """Return the deceleration that is asked for where it is unsafe."""
+        """Return the deceleration that an unsafe state demands, (K,), positive.
+
+        Args:
+            pair: the vehicles.
+        """
         return np.full(np.shape(pair.v_rear_mps), self.hardest_mps2)
 
 
-class CarefulModel(SafetyModel):
+class CarefulModel(ReferenceModel):
     """The careful and competent human driver (CC): UN R157, Annex 3, performance model 1.
 
     Unsafe is a time to collision of 2 s or less.
@@ -82,37 +102,43 @@ class CarefulModel(SafetyModel):
     critical_ttc_s: float = 2.0
 
     def is_unsafe(self, pair: Pair) -> Flags:
-        """Return whether the time to collision is at most 2 s."""
+        """Return whether the time to collision is at most 2 s, (K,).
+
+        Args:
+            pair: the vehicles.
+        """
         return ttc_s(*pair[:3]) <= self.critical_ttc_s
 
 
-class Reg157Model(SafetyModel):
-    """The demand of UN R157 on lane-keeping systems in a cut-in (5.2.5.2), as a way to drive.
+class Reg157Model(ReferenceModel):
+    """The requirement of UN R157 on lane-keeping systems in a cut-in (5.2.5.2), as a driver.
 
     A system has to avoid a collision where TTC > (v_r - v_f) / (2 * 6 m/s2) + 0.35 s when the other
     vehicle intrudes into its lane. The driver brakes at once by 6 m/s2, 0.35 s later.
 
     Attributes:
-        bound_s: the 0.35 s. The published code adds a step, 0.1 s.
+        bound_s: constant part of the bound. The published code adds a step, 0.1 s.
     """
+
+    bound_s = 0.35
 
     delay_steps = 4
     delay_s = 0.35
     growth_mps2 = np.inf
     hardest_mps2 = 6.0
 
-    def __init__(self, bound_s: float = 0.35) -> None:
-        """Take the constant part of the bound."""
-        self.bound_s = bound_s
-
     def is_unsafe(self, pair: Pair) -> Flags:
-        """Return whether the time to collision is down to the bound."""
+        """Return whether the time to collision is at most the bound, (K,).
+
+        Args:
+            pair: the vehicles.
+        """
         closing_mps = pair.v_rear_mps - pair.v_front_mps
         bound_s = closing_mps / (2.0 * self.hardest_mps2) + self.bound_s
         return ttc_s(*pair[:3]) <= bound_s
 
 
-class RssModel(SafetyModel):
+class RssModel(ReferenceModel):
     """Responsibility-sensitive safety (Shalev-Shwartz, Shammah, Shashua, arXiv:1708.06374, 2017).
 
     Unsafe is a gap below the safe distance of definition 1.
@@ -122,12 +148,16 @@ class RssModel(SafetyModel):
     brake_mps2: float = 6.0
 
     def is_unsafe(self, pair: Pair) -> Flags:
-        """Return whether the gap is shorter than the safe distance."""
+        """Return whether the gap is shorter than the safe distance, (K,).
+
+        Args:
+            pair: the vehicles.
+        """
         limits = self.delay_s, self.accel_mps2, self.brake_mps2, self.brake_mps2
         return pair.gap_m < rss_distance_m(pair.v_rear_mps, pair.v_front_mps, *limits)
 
 
-class FsmModel(SafetyModel):
+class FsmModel(ReferenceModel):
     """The fuzzy safety model: performance model 2 of UN R157 (Mattas et al., 2020 and 2022).
 
     Unsafe is PFS + CFS > 0. It brakes by 4 + 2 CFS where CFS > 0, else by 4 PFS.
@@ -139,15 +169,27 @@ class FsmModel(SafetyModel):
     margin_m: float = 2.0
 
     def is_unsafe(self, pair: Pair) -> Flags:
-        """Return whether one of the two metrics is above 0."""
+        """Return whether one of the two metrics is above 0, (K,).
+
+        Args:
+            pair: the vehicles.
+        """
         return self.cfs(pair) + self.pfs(pair) > 0.0
 
     def endangers(self, pair: Pair) -> Flags:
-        """Return whether CFS is above 0: the precaution (PFS) is the rear vehicle's."""
+        """Return whether CFS is above 0, (K,): PFS is a precaution of the rear vehicle alone.
+
+        Args:
+            pair: the vehicles.
+        """
         return self.cfs(pair) > 0.0
 
     def demand_mps2(self, pair: Pair) -> FloatArray:
-        """Return the deceleration that follows from the metrics."""
+        """Return the deceleration that follows from the metrics, (K,), positive.
+
+        Args:
+            pair: the vehicles.
+        """
         critical, comfortable = self.cfs(pair), self.comfortable_mps2
         hard = comfortable + (self.hardest_mps2 - comfortable) * critical
         return np.where(critical > 0.0, hard, comfortable * self.pfs(pair))
@@ -157,6 +199,12 @@ class FsmModel(SafetyModel):
 
         With d = gap - margin: 0 from v_r tau + v_r^2 / (2 * 4) - v_f^2 / (2 * 7) + margin on, 1 up
         to v_r tau + v_r^2 / (2 * 6) - v_f^2 / (2 * 7), linear between.
+
+        Args:
+            pair: the vehicles.
+
+        Returns:
+            The metric, (K,).
         """
         gap_m, v_rear_mps, v_front_mps, _ = pair
         leader_m = v_front_mps * v_front_mps / (2.0 * self.leader_mps2)
@@ -173,6 +221,12 @@ class FsmModel(SafetyModel):
         u its speed by then, s(b) = (v_r + a tau / 2 - v_f) tau + (u - v_f)^2 / (2 b): 0 from s(4)
         on, 1 up to s(6), linear between. Where u < v_f, 1 if the gap closes before the speeds are
         equal, else 0. Where v_r <= v_f, 0.
+
+        Args:
+            pair: the vehicles.
+
+        Returns:
+            The metric, (K,).
         """
         gap_m, v_rear_mps, v_front_mps, a_rear_mps2 = pair
         a = np.maximum(a_rear_mps2, -self.comfortable_mps2)
@@ -189,12 +243,15 @@ class FsmModel(SafetyModel):
 
 
 def ttc_s(gap_m: FloatArray, v_rear_mps: FloatArray, v_front_mps: FloatArray) -> FloatArray:
-    """Return the time to collision, (K,): 0 where they overlap, infinite where the gap opens.
+    """Compute the time to collision.
 
     Args:
         gap_m: gaps from bumper to bumper, (K,).
         v_rear_mps: speeds of the rear vehicle, (K,).
         v_front_mps: speeds of the front vehicle, (K,).
+
+    Returns:
+        The times in s, (K,): 0 where the vehicles overlap, infinite where the gap opens.
     """
     closing = v_rear_mps - v_front_mps
     times = np.where(closing > 0.0, gap_m / np.where(closing > 0.0, closing, 1.0), np.inf)
@@ -209,8 +266,9 @@ def rss_distance_m(
     brake_min_mps2: float,
     brake_max_mps2: float,
 ) -> FloatArray:
-    """Return the safe distance of RSS, (K,): the rear one accelerates for the response time.
+    """Compute the safe distance of RSS.
 
+    The rear vehicle accelerates for the response time, then brakes:
     [v_r rho + a rho^2 / 2 + (v_r + rho a)^2 / (2 b_min) - v_f^2 / (2 b_max)]+.
 
     Args:
@@ -220,6 +278,9 @@ def rss_distance_m(
         accel_mps2: acceleration a of the rear vehicle in that time.
         brake_min_mps2: its least braking b_min after that, positive.
         brake_max_mps2: hardest braking b_max of the front vehicle, positive.
+
+    Returns:
+        The distances in m, (K,).
     """
     fastest = v_rear_mps + response_s * accel_mps2
     stops_m = v_rear_mps * response_s + 0.5 * accel_mps2 * response_s**2
@@ -235,24 +296,43 @@ def _between(gap_m: FloatArray, safe_m: FloatArray, unsafe_m: FloatArray) -> Flo
 
 
 class Reaction:
-    """The reaction of the published models in K corridors: delay, growing deceleration, hold.
+    """The reaction of the published models in K corridors: a delay, then a growing deceleration.
 
-    Steps of the delay are counted while it is unsafe. Then the deceleration grows. Safe again, the
-    driver holds the speed. Neither the delay nor the deceleration is reset.
+    Unsafe steps first count as delay; from then on the deceleration grows in each. In a safe step
+    the driver keeps its speed, and neither the delay nor the deceleration is reset.
+
+    Example:
+        reaction = Reaction(1, CarefulModel())
+        a_mps2 = reaction.acceleration_mps2(unsafe, demand_mps2)
     """
 
-    def __init__(self, corridors: int, model: SafetyModel) -> None:
+    def __init__(self, corridors: int, model: ReferenceModel) -> None:
+        """Begin with a full delay in all corridors.
+
+        Args:
+            corridors: number of corridors, K.
+            model: gives the delay, the growth of the deceleration, and that with a released pedal.
+        """
         self._model = model
         self._waited = np.zeros(corridors, dtype=np.int64)
         self._braking_mps2 = np.full(corridors, model.released_mps2)
 
     def forget(self, corridors: int | Flags) -> None:
-        """Reset some corridors."""
+        """Reset the delay and the deceleration.
+
+        Args:
+            corridors: index of a corridor, or a mask of corridors, (K,).
+        """
         self._waited[corridors] = 0
         self._braking_mps2[corridors] = self._model.released_mps2
 
     def acceleration_mps2(self, unsafe: Flags, demand_mps2: FloatArray | float) -> FloatArray:
-        """Return the accelerations of a step, (K,): 0 where it is safe, else 0 or less."""
+        """Return the accelerations of a step, (K,): 0 where it is safe, else 0 or less.
+
+        Args:
+            unsafe: whether the state is unsafe, (K,).
+            demand_mps2: demanded deceleration, (K,) or one, positive.
+        """
         waits = unsafe & (self._waited < self._model.delay_steps)
         brakes = unsafe & ~waits
         self._waited += waits
