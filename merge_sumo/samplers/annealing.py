@@ -1,7 +1,6 @@
 """Simulated annealing, a baseline of the paper (Dixon and Szego, 1978; Kirkpatrick et al., 1983).
 
-Chains look for the lowest margin and cool down batch by batch. Each ends around one minimum: the
-method is an optimiser, not a search for all regions of failures.
+It is an optimiser: each chain ends at one minimum of the margin.
 """
 
 from __future__ import annotations
@@ -20,10 +19,10 @@ CHAINS = 2
 
 
 class AnnealingSampler(LevelwiseSampler):
-    """Chains that take turns; a batch holds independent moves from the state of each chain.
+    """Lowers the margin by chains of random moves, which cool down from batch to batch.
 
-    The chains are replayed from the history. The random numbers that accept moves follow from seed
-    and batch, so each replay gives the same chains.
+    A batch has independent moves from the state of each chain in turn. The states follow from the
+    history: the random numbers that accept moves depend on the seed and the batch alone.
     """
 
     about = "looks for the lowest margin by simulated annealing"
@@ -32,11 +31,11 @@ class AnnealingSampler(LevelwiseSampler):
     def propose(
         self, history: LevelHistory, n: int, rng: np.random.Generator, level: int
     ) -> FloatArray:
-        """Return `n` moves, (n, d), of the chains; a uniform batch at the start.
+        """Return moves of the chains, (n, d); without outcomes uniform points.
 
         Args:
             history: outcomes of the level.
-            n: number of points.
+            n: number of moves.
             rng: random generator.
             level: level of the POV.
         """

@@ -1,4 +1,4 @@
-"""A batch at one level: candidates, their P(fail), and a greedy choice by expected new coverage."""
+"""Search for a batch at one level: candidates, their P(fail), and a greedy choice."""
 
 from __future__ import annotations
 
@@ -62,19 +62,6 @@ class Proposal:
     gain: FloatArray
 
 
-def covered_grid(history: LevelHistory, pending: FloatArray) -> CoverageGrid:
-    """Return the grid that is covered by the failures of a history, and by pending cases, (m, d).
-
-    A pending case is a pick of an earlier batch: most of its ball counts as covered.
-    """
-    grid = CoverageGrid(history.dims)
-    grid.cover(grid.balls(history.points[history.failed]), 1.0)
-    if len(pending):
-        for ball in grid.balls(pending):
-            grid.cover(ball, PICKED)
-    return grid
-
-
 def greedy(
     grid: CoverageGrid,
     points: FloatArray,
@@ -83,22 +70,21 @@ def greedy(
     n: int,
     last: FloatArray | None = None,
 ) -> tuple[list[int], FloatArray]:
-    """Choose `n` candidates: each adds the most expected coverage to those before it.
+    """Choose candidates one by one, each with the most expected new coverage.
 
     Most of the ball of a pick counts as covered for the later picks: if the pick fails, the ball is
-    covered, and if it does not, its neighbours would probably not have failed either. The aim may
-    include near misses, but only a failure is a gain.
+    covered, and if it does not, its neighbours would probably not have failed either.
 
     Args:
         grid: coverage before the batch; changed in place.
         points: candidates, (m, d).
-        aim: worth of the ball of each, (m,).
-        probability: P(fail) of each, (m,).
+        aim: worth of the ball of each candidate, (m,): P(fail), or that of a failure or near miss.
+        probability: P(fail) of each candidate, (m,).
         n: number of picks.
         last: worth that replaces `aim` for the last pick, (m,).
 
     Returns:
-        Indices of the picks, and their gains, (n,).
+        Indices of the picks, and their expected new coverage in balls, (n,).
     """
     picks: list[int] = []
     gains: list[float] = []
@@ -121,12 +107,18 @@ def greedy(
 
 
 class LevelSearch:
-    """Search for the batch of a level: candidates with P(fail), and a greedy choice among them.
+    """Searches for the batch of a level.
 
     The model of the controller predicts the gaps of the candidates of all levels together, so the
     sampler calls it between the steps of the searches: `screening_candidates` for one member of the
     model, `shortlist` and rounds of `refinement_candidates` for all members, each of these followed
     by `add`, and at last `batch`. Without the model, `surrogate_batch` does all.
+
+    Example:
+        screened = search.screening_candidates()
+        points = search.shortlist(screened, predict_by_one_member(screened), n=5)
+        search.add(points, predict_by_all_members(points))
+        proposal = search.batch(5)
 
     Attributes:
         history: outcomes of the level.
@@ -145,23 +137,30 @@ class LevelSearch:
         Args:
             history: outcomes of the level.
             pending: cases that run and have no outcome yet, (m, d).
-            weight: that of the model of the controller; the surrogate has the rest.
+            weight: weight of the model of the controller, from 0 to 1; the surrogate has the rest.
             rng: generator of the candidates.
         """
         self.history, self.pending = history, pending
         self.surrogate = Surrogate(history) if len(history.points) >= 2 else None
         self._weight, self._rng = weight, rng
-        self._grid = covered_grid(history, pending)
+        self._grid = CoverageGrid(history.dims)
+        self._grid.cover(self._grid.balls(history.points[history.failed]), 1.0)
+        # A pending case is a pick of an earlier batch.
+        for ball in self._grid.balls(pending):
+            self._grid.cover(ball, PICKED)
         self.points: FloatArray = np.empty((0, history.dims))
         self.gaps: FloatArray = np.empty((0, 0))
         self.chance: FloatArray = np.empty(0)
 
     def chances(self, points: FloatArray, gaps: FloatArray) -> FloatArray:
-        """Return P(fail) of cases, (3, n), by the model, by the surrogate, and by both.
+        """Return P(fail) of cases by the model, by the surrogate, and by both.
 
         Args:
             points: cases, (n, d).
             gaps: their predicted gaps, (M, n).
+
+        Returns:
+            Probabilities, (3, n).
         """
         by_model = by_surrogate = chance_by_gaps(gaps)
         if self.surrogate is not None:
@@ -185,12 +184,15 @@ class LevelSearch:
         return np.concatenate(screened)
 
     def shortlist(self, screened: FloatArray, gaps: FloatArray, n: int) -> FloatArray:
-        """Return the first candidates, (m, d), for all members.
+        """Return the first candidates that all members predict.
 
         Args:
-            screened: candidates of one member, (k, d).
-            gaps: its predictions, (1, k).
+            screened: screening candidates, (k, d).
+            gaps: their gaps as one member predicts them, (1, k).
             n: size of the batch.
+
+        Returns:
+            Candidates, (m, d).
         """
         # 20 uniform ones, the best 80 of the member, and the best 40 of the surrogate.
         best = self._ranked(screened, chance_by_gaps(gaps), 80)
@@ -201,7 +203,12 @@ class LevelSearch:
         return np.concatenate(chosen)
 
     def add(self, points: FloatArray, gaps: FloatArray) -> None:
-        """Take candidates, (m, d), with the gaps that all members predict, (M, m)."""
+        """Add candidates to those of the batch.
+
+        Args:
+            points: candidates, (m, d).
+            gaps: their gaps as all members predict them, (M, m).
+        """
         chance = self.chances(points, gaps)[2]
         if len(self.points):
             points = np.concatenate([self.points, points])
@@ -210,14 +217,25 @@ class LevelSearch:
         self.points, self.gaps, self.chance = points, gaps, chance
 
     def refinement_candidates(self, n: int) -> FloatArray:
-        """Return candidates, (m, d), around the best ones and around a batch of `n`."""
+        """Return 60 candidates around the best ones and around a batch chosen among all.
+
+        Args:
+            n: size of the batch.
+
+        Returns:
+            Candidates, (60, d).
+        """
         picks, _ = greedy(self._grid.copy(), self.points, self.chance, self.chance, n)
         best = self._ranked(self.points, self.chance, n)
         centres = self.points[np.concatenate([best, picks])]
         return around(centres, 60, REFINED_REACH * radius_for(self.history.dims), self._rng)
 
     def batch(self, n: int) -> Proposal:
-        """Return the batch of `n` candidates; without a surrogate half is spread over the cube."""
+        """Choose the batch among the candidates; without a surrogate, half fills the cube evenly.
+
+        Args:
+            n: size of the batch.
+        """
         spread: FloatArray = np.empty((0, self.history.dims))
         if self.surrogate is None:
             spread = spread_out(n - n // 2, self.history.dims, self._rng)
@@ -233,13 +251,15 @@ class LevelSearch:
         )
 
     def surrogate_batch(self, n: int) -> Proposal:
-        """Return a batch of `n` cases by the surrogate alone."""
+        """Choose a batch by the surrogate alone.
+
+        Args:
+            n: size of the batch.
+        """
         history, surrogate = self.history, self.surrogate
         assert surrogate is not None, "there are outcomes"  # noqa: S101
         limit = near_miss_limit(history)
-        aimed = surrogate
-        if limit is not None:
-            aimed = Surrogate(history, limit)
+        aimed = surrogate if limit is None else Surrogate(history, limit)
         points = surrogate_candidates(aimed, n, self._rng)
         aim = aimed.predict(points)
         best = points[self._ranked(points, aim, 150)]
@@ -253,6 +273,6 @@ class LevelSearch:
         return Proposal(points[picks], gain)
 
     def _ranked(self, points: FloatArray, chance: FloatArray, most: int) -> IntArray:
-        """Return the indices of the `most` points with the largest expected gain of their own."""
+        """Return the indices of the points with the largest gains of their own, `most` at most."""
         worth = chance * (self._grid.new(self._grid.balls(points)) + EVEN_IF_COVERED)
         return np.argsort(-worth, kind="stable")[:most]

@@ -1,7 +1,4 @@
-"""A model of the controller, which predicts the gaps of cases before they run.
-
-An ensemble of trees learns the accelerations of the VUT, and rolls cases out against the POVs.
-"""
+"""A model of the controller: trees learn its accelerations, and roll cases out against the POVs."""
 
 from __future__ import annotations
 
@@ -22,6 +19,7 @@ from merge_sumo.drivers.levelk import (
 from merge_sumo.drivers.policies import load_network
 from merge_sumo.metrics.bodies import CentreLines
 from merge_sumo.metrics.criterion import PAPER_CRITERION, Criterion
+from merge_sumo.metrics.fmc import BoolArray, IntArray
 from merge_sumo.metrics.merge import REACTION_S
 from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.metrics.regression import regression_gaps
@@ -60,7 +58,12 @@ class TreeInputs:
     """
 
     def __init__(self, scenario: Scenario, rows: int) -> None:
-        """Begin `rows` episodes of a scenario."""
+        """Begin episodes.
+
+        Args:
+            scenario: their scenario.
+            rows: number of episodes, R.
+        """
         self._scenario = scenario
         self._step = 0
         # A ring of what is remembered of the last steps, (steps, 5, R).
@@ -69,8 +72,12 @@ class TreeInputs:
         self._lowest = np.zeros(rows)
         self._highest = np.zeros(rows)
 
-    def keep(self, rows: NDArray[np.bool_]) -> None:
-        """Drop all episodes but those where `rows`, (R,), is true."""
+    def keep(self, rows: BoolArray) -> None:
+        """Drop episodes.
+
+        Args:
+            rows: which episodes are kept, (R,).
+        """
         self._past = self._past[:, :, rows]
         self._since_jump = self._since_jump[rows]
         self._lowest = self._lowest[rows]
@@ -157,6 +164,9 @@ class ModelRollout:
         """Return whether the POV of a level is known, and not a program of the user.
 
         A rollout ends at M: none is possible where the VUT chooses the place of the merge.
+
+        Args:
+            level: level of the POV.
         """
         known = level == 0 or level in self._networks
         return known and self.scenario.lane_m is None
@@ -165,7 +175,7 @@ class ModelRollout:
         """Roll each case out with each controller; all advance together, as arrays.
 
         Args:
-            points: cases of the unit cube by level, (n, d) each; N of all levels.
+            points: cases of the unit cube by level, (n, d) each; N cases of all levels.
             drives: the controllers.
 
         Returns:
@@ -198,9 +208,7 @@ class ModelRollout:
         after[:, :, 0] += DT_S * np.arange(steps + 1)[:, None] * at_m[:, 1]
         return after if steps else None
 
-    def _starts(
-        self, level: int, points: FloatArray
-    ) -> tuple[FloatArray, FloatArray, NDArray[np.int64]]:
+    def _starts(self, level: int, points: FloatArray) -> tuple[FloatArray, FloatArray, IntArray]:
         """Return states (x, v, a), (3, A, n), psi and level, (n,), of cases, (n, d)."""
         scenario = self.scenario
         values = {}
@@ -223,7 +231,7 @@ class ModelRollout:
         points: Mapping[int, FloatArray],
         drives: Sequence[Drive],
         motion: FloatArray | None = None,
-    ) -> tuple[FloatArray, NDArray[np.int64]]:
+    ) -> tuple[FloatArray, IntArray]:
         """Roll each case out with each controller in turn: R rows.
 
         Args:
@@ -292,7 +300,7 @@ class ModelRollout:
     def _decisions(
         self,
         network: QNetwork,
-        cars: NDArray[np.int64],
+        cars: IntArray,
         x_m: FloatArray,
         v_mps: FloatArray,
         svo_rad: FloatArray,
@@ -328,8 +336,8 @@ class ControllerModel:
     state alone, the others also the past. Each member leaves out every GROUPS-th case, so that
     members disagree where cases are few.
 
-    Its predictions are a pure function of the outcomes, whatever their order. The cases of all
-    levels train the same model.
+    It is a `Predictor`: its predictions are a pure function of the outcomes, whatever their order.
+    The cases of all levels train the same model.
 
     Example:
         model = ControllerModel(ModelRollout(pool, povs), seed=1)
@@ -340,7 +348,12 @@ class ControllerModel:
     members = 2 * GROUPS
 
     def __init__(self, rollout: ModelRollout, seed: int) -> None:
-        """Prepare an untrained model; the seed is that of its trees."""
+        """Prepare an untrained model.
+
+        Args:
+            rollout: rolls cases out.
+            seed: seed of the trees.
+        """
         self._rollout, self._seed = rollout, seed
         self._batch: dict[int, int] = {}
         self._motions: dict[int, FloatArray] = {}
@@ -352,7 +365,12 @@ class ControllerModel:
         self._has_learned = False
 
     def tell(self, outcomes: Sequence[Outcome], motions: Mapping[int, FloatArray]) -> None:
-        """Take outcomes and their motions by index; an episode with an error is left out."""
+        """Take outcomes; an episode with an error is left out.
+
+        Args:
+            outcomes: outcomes of any level.
+            motions: their motions, (T + 1, A, 3), by index.
+        """
         self._has_learned = False
         for outcome in outcomes:
             if not outcome.measures.end.is_error:
@@ -360,13 +378,25 @@ class ControllerModel:
                 self._motions[outcome.index] = motions[outcome.index]
 
     def can_predict(self, level: int) -> bool:
-        """Return whether there are four cases to learn from, and the POV of the level is known."""
+        """Return whether there are four cases to learn from, and the POV of the level is known.
+
+        Args:
+            level: level of the POV.
+        """
         return len(self._motions) >= 4 and self._rollout.can_predict(level)
 
     def predict(
         self, points: Mapping[int, FloatArray], member: int | None = None
     ) -> dict[int, FloatArray]:
-        """Return the gaps at M of cases by level, (M, n) each; see `Predictor`."""
+        """Predict the signed gaps of cases.
+
+        Args:
+            points: cases of the unit cube by level of the POV, (n, d) each.
+            member: the only member that predicts; None for all.
+
+        Returns:
+            Gaps by level, (M, n) each, or (1, n) by one member; NaN where the VUT never arrives.
+        """
         if not self._has_learned:
             self._learn()
         members = range(self.members) if member is None else [member]
@@ -432,33 +462,66 @@ class ControllerModel:
 
 
 class ControllerModelPair:
-    """Models of two versions of a VUT; together they predict the gap of a regression.
+    """Models of two versions of a VUT; together they predict the gap of a `regression`.
 
-    See `Predictor` and `regression`. Each member of the new version's model is paired with the
-    member of the old version's model that learned from the same cases.
+    Each member of the new version's model is paired with the member of the old version's model that
+    learned from the same cases.
+
+    Example:
+        pair = ControllerModelPair(ControllerModel(rollout, 1), ControllerModel(old_rollout, 1))
+        pair.tell(outcomes, motions)
+        pair.tell_old(old_outcomes, old_motions)
+        gaps = pair.predict({0: points})[0]
     """
 
     members = ControllerModel.members
 
     def __init__(self, new: ControllerModel, old: ControllerModel) -> None:
-        """Take a model of each version."""
+        """Take the models of both versions.
+
+        Args:
+            new: model of the new version.
+            old: model of the old version, with the same seed.
+        """
         self._new, self._old = new, old
 
     def tell(self, outcomes: Sequence[Outcome], motions: Mapping[int, FloatArray]) -> None:
-        """Take outcomes of the new version and their motions, (T + 1, A, 3), by index."""
+        """Take outcomes of the new version.
+
+        Args:
+            outcomes: outcomes of any level.
+            motions: their motions, (T + 1, A, 3), by index.
+        """
         self._new.tell(outcomes, motions)
 
     def tell_old(self, outcomes: Sequence[Outcome], motions: Mapping[int, FloatArray]) -> None:
-        """Take outcomes of the old version and their motions, in the same way."""
+        """Take outcomes of the old version.
+
+        Args:
+            outcomes: outcomes of the same cases.
+            motions: their motions, (T + 1, A, 3), by index.
+        """
         self._old.tell(outcomes, motions)
 
     def can_predict(self, level: int) -> bool:
-        """Return whether both models can predict cases of a level."""
+        """Return whether both models can predict cases of a level.
+
+        Args:
+            level: level of the POV.
+        """
         return self._new.can_predict(level) and self._old.can_predict(level)
 
     def predict(
         self, points: Mapping[int, FloatArray], member: int | None = None
     ) -> dict[int, FloatArray]:
-        """Return the gaps of a regression by level, (M, n) each; see `Predictor`."""
+        """Predict the signed gaps of regressions.
+
+        Args:
+            points: cases of the unit cube by level of the POV, (n, d) each.
+            member: the only pair of members that predicts; None for all.
+
+        Returns:
+            Gaps by level, (M, n) each, or (1, n) by one pair of members.
+        """
         new, old = self._new.predict(points, member), self._old.predict(points, member)
         return {level: regression_gaps(new[level], old[level]) for level in points}

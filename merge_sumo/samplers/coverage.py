@@ -1,9 +1,4 @@
-"""The default sampler: each batch maximises the expected new failure mode coverage.
-
-The expected gain of a case is P(fail) times the uncovered share of its ball (radius rho of the
-FMC). A batch is chosen greedily among uniform candidates, candidates near failures, and candidates
-near changes of the merging order.
-"""
+"""The default sampler: each batch maximises the expected new failure mode coverage."""
 
 from __future__ import annotations
 
@@ -21,10 +16,19 @@ from merge_sumo.scenario.case import Case, FloatArray
 
 
 class CoverageSampler(Sampler):
-    """Maximises the expected new coverage over all levels.
+    """Maximises the expected new failure mode coverage (FMC) over all levels.
+
+    The expected gain of a case is P(fail) times the uncovered share of its ball (radius rho of the
+    FMC). P(fail) is predicted by a surrogate of the outcomes and by a model of the controller. A
+    batch is chosen greedily among uniform candidates, candidates near failures, and candidates near
+    changes of the merging order.
 
     Gains are in balls, not in volumes: volumes of two and of three dimensions do not compare, and
     level 2 would get no case.
+
+    Example:
+        model = controller_model_of(plan, pool, seed=1)
+        cases = CoverageSampler(pool, 1, model).ask(15)
     """
 
     about = "asks for the batch that promises the most new coverage"
@@ -33,7 +37,11 @@ class CoverageSampler(Sampler):
     overlaps = True
 
     def ask(self, n: int) -> list[Case]:
-        """Return the next `n` cases, level by level."""
+        """Return the next `n` cases, level by level.
+
+        Args:
+            n: number of cases.
+        """
         from threadpoolctl import threadpool_limits
 
         # One thread: rounding must not depend on the number of cores.
@@ -54,7 +62,11 @@ class CoverageSampler(Sampler):
         return cases
 
     def prediction(self, place: int) -> Prediction | None:
-        """Return the prediction of a case of the last batch, by its place in the batch."""
+        """Return the prediction of a case of the last `ask`; None without a model.
+
+        Args:
+            place: its place in the returned list.
+        """
         return self._predictions[place]
 
     def batch_size(self) -> int:
@@ -78,7 +90,8 @@ class CoverageSampler(Sampler):
         self, searches: dict[int, LevelSearch], weight: float, n: int
     ) -> dict[int, Proposal]:
         """Return a batch of `n` cases for each level."""
-        # A model whose predictions did not come true proposes no candidates.
+        # A model whose predictions did not come true proposes no candidates, except where there is
+        # no surrogate either.
         worthless = weight < 0.05 and len(self.observed()) >= 40
         guided = {}
         for level, search in searches.items():
@@ -92,7 +105,8 @@ class CoverageSampler(Sampler):
             elif search.surrogate is not None:
                 proposal = search.surrogate_batch(n)
             else:
-                # The next points of the sequence that the pending ones began.
+                # The next points of the sequence that the pending ones began. Its seed does not
+                # count these, so that it stays the same.
                 begun, told = len(search.pending), self.proposed() - len(self._pending)
                 rng = np.random.default_rng([self.seed, told, level])
                 points = spread_out(begun + n, search.history.dims, rng)[begun:]

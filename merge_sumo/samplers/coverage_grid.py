@@ -26,16 +26,21 @@ class CoverageGrid:
     """The unit cube with a margin, as nodes with the probability of each not to be covered.
 
     Attributes:
-        overlap: distance from which two balls share no node.
+        overlap: distance from which on two balls share no node.
+
+    Example:
+        grid = CoverageGrid(dims=2)
+        grid.cover(grid.balls(failures), 1.0)
+        gain = grid.new(grid.balls(candidates))
     """
 
     def __init__(self, dims: int, *, coarse: bool = False) -> None:
         """Prepare an uncovered grid.
 
         Args:
-            dims: number of dimensions.
-            coarse: whether the nodes are .01 apart in two dimensions, and a ball of more than three
-                has the volume of one of three.
+            dims: number of dimensions, 2 to 6.
+            coarse: whether nodes are .01 apart in two dimensions instead of .0025, and a ball in
+                more than three dimensions has the volume of a ball in three.
         """
         # A fine grid resolves slivers, the gain of a case late in a search. It is cheap in two
         # dimensions.
@@ -48,21 +53,40 @@ class CoverageGrid:
         self._open = np.ones(self._nodes.count, dtype=np.float32)
 
     def copy(self) -> Self:
-        """Return a grid that is covered as this one is."""
+        """Return an independent grid with the same coverage."""
         other = copy(self)
         other._open = self._open.copy()
         return other
 
     def balls(self, points: FloatArray) -> IntArray:
-        """Return the nodes of the ball around each point, (n, nodes)."""
+        """Return the balls around points.
+
+        Args:
+            points: centres, (n, d).
+
+        Returns:
+            Indices of their nodes, (n, nodes of a ball).
+        """
         return self._nodes.balls(points)
 
     def new(self, balls: IntArray) -> FloatArray:
-        """Return the expected share of each ball that is not covered, (n,)."""
+        """Return the expected uncovered shares of balls.
+
+        Args:
+            balls: their nodes, (n, nodes of a ball).
+
+        Returns:
+            Shares from 0 to 1, (n,).
+        """
         return np.asarray(self._open.take(balls).mean(axis=1), dtype=np.float64)
 
     def cover(self, balls: IntArray, probability: float) -> None:
-        """Cover balls with a probability."""
+        """Cover balls with a probability.
+
+        Args:
+            balls: their nodes, of any shape. A node of several balls is covered once.
+            probability: probability that the balls are covered.
+        """
         self._open[balls] *= np.float32(1.0 - probability)
 
 

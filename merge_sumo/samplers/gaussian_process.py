@@ -6,11 +6,11 @@ Source: Rasmussen and Williams (2006), Gaussian Processes for Machine Learning.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import cho_solve, cholesky, solve_triangular
 from scipy.optimize import minimize
 from scipy.spatial import cKDTree
 
+from merge_sumo.metrics.fmc import IntArray
 from merge_sumo.scenario.case import FloatArray
 
 # Variance of the observation noise: it keeps matrices with close cases invertible.
@@ -26,11 +26,12 @@ class GaussianProcess:
     a slanted curve, and a process with a short length across it and a long one along it needs fewer
     cases.
 
+    Attributes:
+        rotation: Q, orthonormal, (d, d); the first column is the direction of the mean slope of the
+            values.
+
     Example:
         mean, variance = GaussianProcess(points, values).predict(queries)
-
-    Attributes:
-        rotation: orthonormal, (d, d); the first column is the mean slope of the values.
     """
 
     def __init__(
@@ -39,11 +40,11 @@ class GaussianProcess:
         """Learn values at points.
 
         Args:
-            points: (N, d).
-            values: (N,).
+            points: points of the unit cube, (N, d).
+            values: values of any unit, (N,).
             rough: whether values may jump along the first axis.
-            noisy: whether values differ from run to run: then their noise is learned, too, and
-                `predict` predicts a run.
+            noisy: whether values differ from run to run. Then the variance of their noise is
+                learned, too, and `predict` predicts a run.
         """
         self.rotation = _rotation(points, values)
         self._values, self._rough = values, rough
@@ -60,14 +61,25 @@ class GaussianProcess:
         self._alpha = cho_solve((self._factor, True), values, check_finite=False)
 
     def leave_one_out(self) -> tuple[FloatArray, FloatArray]:
-        """Return mean and variance at each case, (N,), predicted from all others; eq. (5.12)."""
+        """Predict the value at each point from all other points; eq. (5.12).
+
+        Returns:
+            Means and variances, (N,) each.
+        """
         identity = np.eye(len(self._factor))
         inverse = solve_triangular(self._factor, identity, lower=True, check_finite=False)
         precision = np.square(inverse).sum(axis=0)
         return self._values - self._alpha / precision, 1.0 / precision
 
     def predict(self, queries: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return mean and variance at queries, (m, d), as (m,)."""
+        """Predict values.
+
+        Args:
+            queries: points of the unit cube, (m, d).
+
+        Returns:
+            Means and variances, (m,) each.
+        """
         cross = self._covariance(queries @ self.rotation)
         root = solve_triangular(self._factor, cross, lower=True, check_finite=False)
         explained = np.square(root).sum(axis=0)
@@ -83,16 +95,16 @@ class GaussianProcess:
         return covariance
 
 
-def spaced(points: FloatArray, spacing: float, most: int) -> NDArray[np.int64]:
+def spaced(points: FloatArray, spacing: float, most: int) -> IntArray:
     """Choose the first points that lie apart.
 
     Args:
-        points: (N, d).
-        spacing: least distance.
+        points: points in the order of preference, (N, d).
+        spacing: least distance of two chosen points.
         most: largest number of points.
 
     Returns:
-        Their indices.
+        Indices of the chosen points in rising order.
     """
     tree = cKDTree(points)
     free = np.ones(len(points), dtype=bool)

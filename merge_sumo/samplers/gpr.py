@@ -22,7 +22,7 @@ ALPHA = 0.95
 # Powers (z1, z2) and (z3, z4) of the predicted badness and of its variance.
 Z_EXPLOIT = (4.0, 1.0)
 Z_EXPLORE = (1.0, 2.0)
-# Value of a query whose ball is covered.
+# Value of a query with a covered ball.
 FLOOR = 1e-3
 # Variance of the observation noise: the badness has a jump, which a smooth surrogate can only fit
 # as noise.
@@ -33,13 +33,12 @@ LENGTH_BOUNDS = (0.035, 5.0)
 
 
 class GprSampler(LevelwiseSampler):
-    """Zero-mean Gaussian process with a squared-exponential kernel on the badness, epsilon-greedy.
+    """Chooses cases epsilon-greedily by a Gaussian process on the badness.
 
-    The badness of a margin m is 1 - m, which is P / lambda under the paper's criterion: the powers
-    of q = mu^z1 Var^z2 need positive numbers. The picks of a batch follow each other, each with the
-    variance conditioned on the earlier ones (it does not depend on their results): that spreads the
-    batch out. The value of a query is multiplied by the share of its ball (radius rho of the FMC)
-    that no failure and no pick covers.
+    The badness of a margin m is 1 - m, which is P / lambda under the paper's criterion. The process
+    has mean zero and a squared-exponential kernel. A query has the value q = mu^z1 Var^z2, times
+    the share of its ball (radius rho of the FMC) that no failure and no pick covers. Each pick of a
+    batch lowers the variance for the later ones, which spreads the batch out.
     """
 
     about = "chooses by a Gaussian process on the margin: the paper's Algorithm 1"
@@ -47,7 +46,11 @@ class GprSampler(LevelwiseSampler):
     overlaps = True
 
     def allocate(self, n: int) -> dict[int, int]:
-        """Return equal shares first, then shares by the softmax of the last failure shares."""
+        """Return equal numbers at first, then numbers by the softmax of the last failure shares.
+
+        Args:
+            n: number of cases of the batch.
+        """
         weights = {}
         for level in self.pool.levels:
             # In proportion to exp(xi U_k), with xi = 3.
@@ -55,7 +58,11 @@ class GprSampler(LevelwiseSampler):
         return self.shares(n, weights)
 
     def failure_share(self, level: int) -> float:
-        """Return U(i, k): the share of failures in the last batch that had cases at level k."""
+        """Return U(i, k), the share of failures in the last batch with cases of a level.
+
+        Args:
+            level: level of the POV, k.
+        """
         outcomes = self.observed(level)
         if not outcomes:
             return 0.0
@@ -66,7 +73,7 @@ class GprSampler(LevelwiseSampler):
     def propose(
         self, history: LevelHistory, n: int, rng: np.random.Generator, level: int
     ) -> FloatArray:
-        """Return `n` points by lines 1 to 9 of Algorithm 1.
+        """Return points, (n, d), by lines 1 to 9 of Algorithm 1; without outcomes uniform ones.
 
         Args:
             history: outcomes of the level.
@@ -166,6 +173,14 @@ def _noise(history: LevelHistory) -> FloatArray | float:
 
 
 def predicted_margin(history: LevelHistory, points: FloatArray) -> FloatArray:
-    """Return the margin that the surrogate predicts at points, (m, d), as (m,)."""
+    """Predict margins by the surrogate.
+
+    Args:
+        history: outcomes of a level, at least one.
+        points: points of the unit cube, (m, d).
+
+    Returns:
+        Margins, (m,).
+    """
     margin: FloatArray = 1.0 - _fit(history).predict(points)
     return margin

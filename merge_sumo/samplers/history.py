@@ -6,8 +6,8 @@ from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from merge_sumo.metrics.fmc import BoolArray, IntArray
 from merge_sumo.scenario.case import FloatArray
 
 
@@ -55,11 +55,11 @@ class LevelHistory:
 
     points: FloatArray
     margin: FloatArray
-    failed: NDArray[np.bool_]
+    failed: BoolArray
     gap: FloatArray
-    batch: NDArray[np.int64]
-    runs: NDArray[np.int64]
-    failures: NDArray[np.int64]
+    batch: IntArray
+    runs: IntArray
+    failures: IntArray
     variance: FloatArray
     varies: bool
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import expit, ndtr
 
+from merge_sumo.metrics.fmc import BoolArray
 from merge_sumo.metrics.outcome import NO_GAP, Outcome
 from merge_sumo.scenario.case import FloatArray
 
@@ -17,12 +17,23 @@ WIDTHS = ((0.01, 0.35), (0.1, 0.35), (0.35, 0.25))
 
 
 def compressed(gaps: FloatArray) -> FloatArray:
-    """Return gaps on a scale that is logarithmic where they are large."""
+    """Compress gaps to a scale that is logarithmic where they are large.
+
+    Args:
+        gaps: signed gaps of any shape; NaN where the VUT never arrives.
+    """
     return np.arcsinh(np.nan_to_num(gaps, nan=NO_GAP))
 
 
 def chance_by_gaps(gaps: FloatArray) -> FloatArray:
-    """Return P(fail), (n,), by the gaps, (M, n), that the members of an ensemble predict."""
+    """Return P(fail) by the predictions of an ensemble.
+
+    Args:
+        gaps: signed gaps by M members for n cases, (M, n).
+
+    Returns:
+        Probabilities, (n,).
+    """
     predicted, limit = compressed(gaps), np.arcsinh(1.0)
     # The scale is 9 long: -45 to 45 times the limit.
     chance = np.full(gaps.shape[1], 0.05 * 2.0 * limit / 9.0)
@@ -33,9 +44,13 @@ def chance_by_gaps(gaps: FloatArray) -> FloatArray:
 
 
 def disagreement(gaps: FloatArray) -> FloatArray:
-    """Return the information in cases, (n,), by predicted gaps, (M, n).
+    """Return how informative cases are: very, where members disagree on a gap that may be small.
 
-    Large where members disagree on a gap that may be small.
+    Args:
+        gaps: signed gaps by M members for n cases, (M, n).
+
+    Returns:
+        Information without a unit, (n,).
     """
     predicted = compressed(gaps)
     near = np.exp(-0.25 * np.square(np.median(predicted, axis=0)))
@@ -48,6 +63,12 @@ def model_weight(outcomes: Sequence[Outcome]) -> float:
 
     It is logistic in the difference of their log likelihoods of the verdicts. A verdict counts half
     after 40 cases, as the model learns.
+
+    Args:
+        outcomes: outcomes in their order; those without a prediction are ignored.
+
+    Returns:
+        Weight from 0 to 1; 0.5 without predictions.
     """
     # Older verdicts count less than the last digit of the sum.
     chances, failed = _predictions(outcomes[-2000:])
@@ -61,12 +82,15 @@ def gain_factor(outcomes: Sequence[Outcome]) -> float:
     """Return the share of the predicted failures of the last 100 picks that came true, at most 1.
 
     Picks have a large P(fail), so that P(fail) is biased upwards among them.
+
+    Args:
+        outcomes: outcomes in their order; those without a prediction are ignored.
     """
     chances, failed = _predictions(outcomes[-100:])
     return min((float(failed.sum()) + 1.0) / (float(chances[:, 2].sum()) + 1.0), 1.0)
 
 
-def _predictions(outcomes: Sequence[Outcome]) -> tuple[FloatArray, NDArray[np.bool_]]:
+def _predictions(outcomes: Sequence[Outcome]) -> tuple[FloatArray, BoolArray]:
     """Return P(fail) by the model, the surrogate and both, (N, 3), and whether cases failed."""
     chances, failed = [], []
     for outcome in outcomes:

@@ -39,10 +39,13 @@ class SubsetState:
 
 
 def replay(history: LevelHistory) -> SubsetState:
-    """Return the state after a history of batches that `SubsetSampler` proposed.
+    """Return the state after the batches that `SubsetSampler` proposed.
 
-    The k-th move of a stage belongs to chain k modulo their number. The last batch of a stage may
-    have a few samples more than the stage needs; they count for it.
+    The k-th move of a stage belongs to chain k modulo their number. Surplus samples of the last
+    batch of a stage count for it.
+
+    Args:
+        history: outcomes of the level.
     """
     number, threshold, moved = 0, np.inf, 0
     chains, levels = np.empty((0, history.dims)), np.empty(0)
@@ -77,7 +80,7 @@ def replay(history: LevelHistory) -> SubsetState:
 
 
 class SubsetSampler(LevelwiseSampler):
-    """Conditional regions and Markov chains; the last region, the failures, is sampled to the end.
+    """Samples conditional regions by Markov chains; the last region is that of the failures.
 
     Moves are reflected at the faces of the cube. That keeps them symmetric, so under the uniform
     distribution each is accepted exactly where it stays in the region.
@@ -89,11 +92,11 @@ class SubsetSampler(LevelwiseSampler):
     def propose(
         self, history: LevelHistory, n: int, rng: np.random.Generator, level: int
     ) -> FloatArray:
-        """Return the next move of `n` chains, (n, d), or uniform points at first.
+        """Return moves of the chains, (n, d); uniform points in the first stage.
 
         Args:
             history: outcomes of the level.
-            n: number of points.
+            n: number of moves.
             rng: random generator.
             level: level of the POV.
         """

@@ -9,11 +9,10 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.special import expit, log_expit, logit, ndtr
 
-from merge_sumo.metrics.fmc import radius_for
+from merge_sumo.metrics.fmc import BoolArray, IntArray, radius_for
 from merge_sumo.metrics.outcome import NO_GAP
 from merge_sumo.samplers.gaussian_process import GaussianProcess
 from merge_sumo.samplers.history import LevelHistory, most_informative
@@ -167,7 +166,7 @@ def nearest(points: FloatArray, others: FloatArray) -> FloatArray:
     return distance
 
 
-def _groups(history: LevelHistory) -> list[NDArray[np.bool_]]:
+def _groups(history: LevelHistory) -> list[BoolArray]:
     """Return which cases failed in a run, and which safe ones are of either order, each (N,)."""
     failed = history.failures > 0
     pov_first = signed_gaps(history) >= 0.0
@@ -181,7 +180,7 @@ def _chance_within(mean: FloatArray, variance: FloatArray) -> FloatArray:
     return chance
 
 
-def _nearest_other(points: FloatArray, group: NDArray[np.bool_]) -> FloatArray:
+def _nearest_other(points: FloatArray, group: BoolArray) -> FloatArray:
     """Return the distance of each point to the nearest of a group but itself; at most 1."""
     distance = nearest(points, points[group])
     if group.sum() > 1:
@@ -215,7 +214,7 @@ def _regression_inputs(chance: FloatArray, distances: list[FloatArray], dims: in
 
 
 def fit_logistic(
-    inputs: FloatArray, failures: NDArray[np.integer | np.bool_], runs: NDArray[np.int64]
+    inputs: FloatArray, failures: IntArray, runs: IntArray
 ) -> tuple[FloatArray, FloatArray]:
     """Fit W logistic regressions at once, by Newton's method; a step that worsens one is halved.
 

@@ -15,7 +15,11 @@ class UniformSampler(Sampler):
     overlaps = True
 
     def ask(self, n: int) -> list[Case]:
-        """Return the next `n` cases, level by level."""
+        """Return the next `n` cases, level by level.
+
+        Args:
+            n: number of cases.
+        """
         cases: list[Case] = []
         for level, share in self.shares(n).items():
             points = self.rng(level).random((share, len(self.pool.scenario.dimensions(level))))
