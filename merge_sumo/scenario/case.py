@@ -10,21 +10,13 @@ import math
 import zlib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
-from operator import attrgetter
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from merge_sumo.errors import UserError
-from merge_sumo.scenario.imperfection import (
-    ACT,
-    PERFECT_ACTUATION,
-    PERFECT_SENSING,
-    SENSE,
-    Actuation,
-    Sensing,
-)
+from merge_sumo.scenario.imperfection import ACT, SENSE, Actuation, Sensing, check_amount
 from merge_sumo.scenario.scenario import (
     ALL_LEVELS,
     IMPERFECTIONS,
@@ -38,10 +30,6 @@ from merge_sumo.scenario.scenario import (
 )
 
 FloatArray = NDArray[np.float64]
-_IMPERFECT_FIELDS = [coordinate.field for coordinate in IMPERFECTIONS]
-_imperfections = attrgetter(*_IMPERFECT_FIELDS)
-_NONE = (None,) * len(IMPERFECTIONS)
-_PERFECT = (PERFECT_SENSING, PERFECT_ACTUATION)
 MOST_DRAWS = 2**32
 """Maximum number of draws of a case: 4 bytes."""
 MOST_SVO_RAD = math.nextafter(SVO.high, 0.0)
@@ -109,8 +97,7 @@ class Case:
             ("svo_rad", self.svo_rad or 0.0, SVO.low, MOST_SVO_RAD),
             ("draw", self.draw, 0, MOST_DRAWS - 1),
         ):
-            if not low <= value <= high:
-                raise UserError(f"{name} is {value}: choose between {low:g} and {high:g}")
+            check_amount(name, value, (low, high))
         self._check_imperfections()
         self._check_headways()
 
@@ -171,14 +158,13 @@ class Case:
 
     def _check_imperfections(self) -> None:
         """Raise `UserError` where a range has no number, or a number no range."""
-        numbers, scenario = _imperfections(self), self.scenario
-        if numbers == _NONE and (scenario.sense, scenario.act) == _PERFECT:
-            return
-        wanted = scenario.imperfect_fields
-        for name, value in zip(_IMPERFECT_FIELDS, numbers, strict=True):
-            if (value is not None) != (name in wanted):
-                raise UserError(f"{name} belongs to a range of the scenario: give it there alone")
-        if wanted:
+        ranges = self.scenario.imperfect_fields
+        for coordinate in IMPERFECTIONS:
+            if (coordinate.of(self) is not None) != (coordinate.field in ranges):
+                raise UserError(
+                    f"{coordinate.field} belongs to a range of the scenario: give it there alone"
+                )
+        if ranges:
             # Checks the numbers.
             _ = self.sensing, self.actuation
 

@@ -19,6 +19,27 @@ Amount = float | Bounds
 """A number, or a range: then it is a coordinate of the pool."""
 
 
+def check_amount(name: str, value: Amount, possible: Bounds) -> None:
+    """Check a number or a range.
+
+    Args:
+        name: its name, for messages.
+        value: the number or the range.
+        possible: lowest and highest possible number.
+
+    Raises:
+        UserError: a number is impossible, or the range is empty.
+    """
+    low, high = possible
+    numbers = value if isinstance(value, tuple) else (value,)
+    text = "..".join(f"{number:g}" for number in numbers)
+    for number in numbers:
+        if not low <= number <= high:
+            raise UserError(f"{name} is {text}: choose {low:g} to {high:g}")
+    if isinstance(value, tuple) and not value[0] < value[1]:
+        raise UserError(f"{name} is {text}: the first number of a range must be the lower")
+
+
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Imperfection:
     """Base of `Sensing` and `Actuation`: numbers and ranges by name."""
@@ -33,13 +54,7 @@ class Imperfection:
             UserError: a number is impossible, or a range is empty.
         """
         for field, value in self._numbers():
-            low, high = self.possible[field]
-            numbers = value if isinstance(value, tuple) else (value,)
-            text = "..".join(f"{x:g}" for x in numbers)
-            if not all(low <= x <= high for x in numbers):
-                raise UserError(f"{field} is {text}: choose {low:g} to {high:g}")
-            if len(numbers) == 2 and not numbers[0] < numbers[1]:
-                raise UserError(f"{field} is {text}: the first number of a range must be the lower")
+            check_amount(field, value, self.possible[field])
 
     def _numbers(self) -> Iterator[tuple[str, Amount]]:
         """Yield (field, value) of the fields with a value."""

@@ -1,9 +1,7 @@
-"""Scenarios as values: starts and limits of the vehicles, and which gaps are too small.
+"""Scenarios: starts and limits of the vehicles of a merge, and the gaps that are too small.
 
-A `Scenario` is a merge from a ramp. Each path has its own coordinate: the distance of the front
-bumper along its lanes from the merge point M, in metres, negative before M. A case is a point of a
-scenario and holds it: drivers, rollout and score take its limits from the case. `US23` is
-the paper's: Wang et al., sections VI and VII and Table I.
+Positions are lane coordinates: distances of front bumpers along the lanes of a path from the merge
+point M, in m, negative before M. `US23` is the scenario of the paper (Wang et al., Table I).
 """
 
 from __future__ import annotations
@@ -24,6 +22,7 @@ from merge_sumo.scenario.imperfection import (
     SENSE,
     Actuation,
     Sensing,
+    check_amount,
 )
 
 if TYPE_CHECKING:
@@ -35,17 +34,17 @@ DT_S = 0.1
 LEVELS = (0, 1, 2)
 """Levels of reasoning of the POV."""
 OWN = 3
-"""Stands for a level where a user's own controller is the POV; users write and read "own"."""
+"""Level of a POV that is a controller of the user; texts call it "own"."""
 ALL_LEVELS = (*LEVELS, OWN)
 DEADLINE_S = 5.0
-"""A VUT that takes longer than this for one step, or for one reset, is a VUT_ERROR."""
+"""Maximum time of a VUT for a step or a reset, else the case is a VUT_ERROR."""
 MEMORY_GIB = 4.0
-"""A user's code that takes more memory than this fails to get it."""
+"""Maximum memory of the code of a user."""
 MAX_EPISODE_S = 120.0
-"""No scenario lets an episode last longer."""
+"""Maximum duration of an episode in any scenario."""
 
 MAX_FOLLOW_UP_S = 30.0
-"""Longest follow-up of vehicles after M."""
+"""Maximum duration of the follow-up after M."""
 
 ROOM_AFTER_M = 2000.0
 """Minimum length of the road after M."""
@@ -55,18 +54,33 @@ Edges = Annotated[tuple[str, ...], Meta(min_length=1, description='edges, as in 
 
 
 def level_name(level: int) -> str:
-    """Return the name of a level in texts."""
+    """Return the name of a level in texts.
+
+    Args:
+        level: one of `ALL_LEVELS`.
+    """
     return "own" if level == OWN else str(level)
 
 
 AnyLevels = int | str | Iterable[int | str]
 
 
-def names_of_levels(asked: AnyLevels) -> tuple[str, ...]:
-    """Return the names of the levels that a user lists, in a text with commas."""
-    listed = asked if isinstance(asked, Iterable) else [asked]
-    parts = asked.split(",") if isinstance(asked, str) else listed
-    return tuple(dict.fromkeys(str(part).strip() for part in parts)) or ("",)
+def names_of_levels(levels: AnyLevels) -> tuple[str, ...]:
+    """Return the names of the levels of an argument, each once.
+
+    Args:
+        levels: a level, levels, or a text with commas.
+
+    Example:
+        >>> names_of_levels("0, 2, own")
+        ('0', '2', 'own')
+    """
+    if isinstance(levels, str):
+        levels = levels.split(",")
+    elif isinstance(levels, int):
+        levels = [levels]
+    names = [str(level).strip() for level in levels]
+    return tuple(dict.fromkeys(names)) or ("",)
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,12 +89,12 @@ class Coordinate:
 
     Attributes:
         field: name of the field.
-        name: its name in texts.
-        unit: its unit.
-        digits: digits after the point.
-        symbol: its label in figures of the paper's scenario.
-        low: lower bound.
-        high: upper bound.
+        name: name in texts.
+        unit: unit in texts; empty for a share.
+        digits: number of digits after the decimal point.
+        symbol: label of the axis in figures of the paper's scenario.
+        low: lower bound in the pool.
+        high: upper bound in the pool.
     """
 
     field: str
@@ -92,22 +106,43 @@ class Coordinate:
     high: float = 1.0
 
     def of(self, case: Any) -> float | None:
-        """Return the value of a case; None where its level has no such coordinate."""
+        """Return the value of a case.
+
+        Args:
+            case: a `Case`.
+
+        Returns:
+            The value; None where the level of the case has no such coordinate.
+        """
         value: float | None = getattr(case, self.field)
         return value
 
     def share(self, case: Any) -> float:
-        """Return where a case is between the bounds, from 0 to 1; 0 where it has no value."""
+        """Return the place of a case between the bounds.
+
+        Args:
+            case: a `Case`.
+
+        Returns:
+            0 at the lower bound, 1 at the upper bound; 0 for a case without a value.
+        """
         return ((self.of(case) or self.low) - self.low) / (self.high - self.low)
 
     def text(self, case: Any) -> str:
-        """Return the value of a case for a table; empty where there is none."""
+        """Return the value of a case for a table.
+
+        Args:
+            case: a `Case`.
+
+        Returns:
+            The value without its unit; empty for a case without a value.
+        """
         value = self.of(case)
         return "" if value is None else f"{value:.{self.digits}f}"
 
 
 SVO = Coordinate("svo_rad", "psi", "rad", 2, "$\\psi$ (rad)", 0.0, math.pi / 2)
-"""psi in [0, pi/2): the upper end itself is outside the pool."""
+"""Orientation psi in [0, pi/2)."""
 IMPERFECTIONS = (
     Coordinate("sense_delay_s", "sensing delay", "s", 2),
     Coordinate("sense_noise_x_m", "noise of x", "m", 2),
@@ -119,7 +154,7 @@ IMPERFECTIONS = (
     Coordinate("act_delay_s", "actuator delay", "s", 2),
     Coordinate("act_power_w_per_kg", "power", "W/kg", 1),
 )
-"""Numbers of `SENSE` or `ACT`, by the fields of a case."""
+"""Coordinates for ranges of `sense` and `act`."""
 COORDINATES = (
     Coordinate("x_pov0_m", "x_POV0", "m", 1, "$x_{POV}^0$ (m)"),
     Coordinate("v_pov0_mps", "v_POV0", "m/s", 2, "$v_{POV}^0$ (m/s)"),
@@ -128,19 +163,19 @@ COORDINATES = (
     Coordinate("headway_behind_s", "headway behind", "s", 2),
     *IMPERFECTIONS,
 )
-"""Coordinates of the pool in order, without the SVO: a scenario has those with a range."""
+"""Coordinates of the pool in order, except the SVO. A scenario has those with a range."""
 
 POV = 0
 VUT = 1
 AHEAD = 2
 BEHIND = 3
-"""Rows of the vehicles of an episode, in every array that has one for each. The mainline is driven
-on by the POV and, in traffic, by a car ahead of it and one behind it."""
+"""Indices of the vehicles of an episode in every array with one row for each. The POV and, in
+traffic, the cars ahead of it and behind it are cars of the mainline."""
 VEHICLES = ("pov", "vut", "ahead", "behind")
-"""Their names."""
+"""Names of the vehicles, by index."""
 COLOURS = {"pov": "#e69f00", "vut": "#0072b2", "ahead": "#009e73", "behind": "#a6518b"}
-"""Their colours in every picture (Okabe and Ito, 2008); `report.css` has lighter ones for dark
-pages."""
+"""Colours of the vehicles in every picture (Okabe and Ito, 2008); `report.css` has lighter ones for
+dark pages."""
 Vehicle = Annotated[str, Meta(pattern="^(pov|vut|ahead|behind)$", description="a vehicle's name")]
 
 EpisodeTime = Annotated[float, Meta(ge=0.0, le=MAX_EPISODE_S)]
@@ -148,7 +183,11 @@ EpisodeTime = Annotated[float, Meta(ge=0.0, le=MAX_EPISODE_S)]
 
 
 def rgb(vehicle: str) -> tuple[int, int, int]:
-    """Return the colour of a vehicle as red, green and blue, of 255."""
+    """Return the colour of a vehicle as red, green and blue between 0 and 255.
+
+    Args:
+        vehicle: one of `VEHICLES`.
+    """
     red, green, blue = bytes.fromhex(COLOURS[vehicle][1:])
     return red, green, blue
 
@@ -183,7 +222,7 @@ RANGES: dict[str, Bounds] = {
     "v_start_max_mps": _SPEED_MPS,
     "lane_m": (-2000.0, 2000.0),
 }
-"""Possible numbers of a road and its cars, by field: up to 360 km/h, 2 g, 5 km."""
+"""Lowest and highest possible number of each field: up to 360 km/h, 2 g and 5 km."""
 
 V_VUT0_MPS = 18.0
 """Speed at which the paper's VUT starts."""
@@ -191,9 +230,7 @@ V_VUT0_MPS = 18.0
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Scenario:
-    """A merge: the VUT comes from the ramp and the POV on the mainline, and an episode ends at M.
-
-    Raises `UserError` for impossible numbers.
+    """A merge of the VUT, from the ramp, with the POV on the mainline.
 
     Example:
         >>> slow = dataclasses.replace(US23, name="slow", v_pov0_mps=(15.0, 25.0))
@@ -201,43 +238,45 @@ class Scenario:
         25.0
 
     Attributes:
-        name: its name.
-        net: the SUMO net; None for the shipped one.
-        x_vut0_m: where the VUT starts.
-        v_vut0_mps: how fast the VUT is then, unless a campaign says otherwise: it is observed, not
-            chosen by the tester. A range makes it a coordinate of the pool.
-        tau_s: reaction time with which a car of the mainline follows the one ahead of it (Krauss).
-        min_gap_m: distance that it keeps from it at a stand.
-        pov_length_m: length of the POV and of other cars of the mainline.
+        name: name of the scenario.
+        net: path of the SUMO net; None for that of the paper's scenario.
+        x_vut0_m: start of the VUT.
+        v_vut0_mps: speed of the VUT at the start, which the tester observes and does not choose. A
+            range makes it a coordinate of the pool.
+        tau_s: reaction time with which a car of the mainline follows the car ahead (Krauss).
+        min_gap_m: gap to the car ahead at standstill.
+        pov_length_m: length of the cars of the mainline.
         vut_length_m: length of the VUT.
         a_min_mps2: hardest braking of all vehicles, negative.
         a_max_mps2: hardest acceleration of all vehicles.
         timeout_s: an episode that has not ended by then is a TIMEOUT.
-        follow_up_s: how long all drive on after M.
-        v_hw_min_mps: lowest speed that the mainline drives at.
-        v_hw_max_mps: highest speed that it drives at.
+        follow_up_s: duration of the simulation after M.
+        v_hw_min_mps: lowest speed of the mainline.
+        v_hw_max_mps: highest speed of the mainline.
         v_min_mps: below this the VUT is slow.
         ttc_min_s: a time to collision below this is short.
-        dx_crash_m: front bumpers nearer than this are a collision under the paper's rule.
-        dx_critical_m: nearer than this is critical.
-        level0_a_mps2: acceleration of a level-0 VUT (section VI-B),
-        level0_v_mps: up to this speed, which it holds.
-        reach_m: no vehicle starts farther from M than this.
-        v_start_max_mps: no vehicle starts faster than this.
-        sense: how the VUT senses other cars.
-        act: how it obeys its controller.
-        mainline: edges of the mainline, in driving order, past M.
-        ramp: edges of the ramp, in driving order, past M.
-        x_pov0_m: where the POV may start, low and high.
-        v_pov0_mps: how fast it may be then.
-        headway_ahead_s: time headways at which a car drives ahead of the POV, low and high: the
-            distance of their front bumpers is the headway times the POV's speed, which is also
-            that of the car. A coordinate of the pool; None where there is no such car.
-        headway_behind_s: the same of a car behind the POV; given with the other, or not at all.
-        lane_m: where the acceleration lane begins and ends, around M, which is where a merge is
-            expected; None where M is the only place to merge.
-        lane_end: the effect of the end of that lane on a VUT that has not merged: "merge" moves it
-            to the mainline, "stop" brakes it to a stand before the end.
+        dx_crash_m: front bumpers nearer than this collide under the paper's rule.
+        dx_critical_m: front bumpers nearer than this are critical.
+        level0_a_mps2: acceleration of a level-0 VUT (section VI-B).
+        level0_v_mps: speed up to which a level-0 VUT accelerates, and which it holds.
+        reach_m: maximum distance of a start before M.
+        v_start_max_mps: maximum speed at the start.
+        sense: sensing of other cars by the VUT.
+        act: actuation of the VUT.
+        mainline: ids of the edges of the mainline, in driving order, past M.
+        ramp: ids of the edges of the ramp, in driving order, past M.
+        x_pov0_m: range of the start of the POV.
+        v_pov0_mps: range of the speed of the POV at the start.
+        headway_ahead_s: range of the time headway of a car ahead of the POV: the distance of their
+            front bumpers is the headway times the speed of both. None without traffic.
+        headway_behind_s: range of the time headway of a car behind the POV; None without traffic.
+        lane_m: begin and end of the acceleration lane, around M, where a merge is expected; None
+            where M is the only place to merge.
+        lane_end: effect of the end of that lane on a VUT that has not merged: "merge" moves it to
+            the mainline, "stop" brakes it to a standstill before the end.
+
+    Raises:
+        UserError: a number is impossible, or numbers contradict each other.
     """
 
     name: str = "us23"
@@ -275,40 +314,35 @@ class Scenario:
 
     def __post_init__(self) -> None:
         """Check the numbers one by one, then together."""
-        for name, (low, high) in RANGES.items():
-            value = getattr(self, name)
-            for number in value if isinstance(value, tuple) else (value,):
-                if number is not None and not low <= number <= high:
-                    raise UserError(f"{name} is {value}: choose {low:g} to {high:g}")
+        for name, possible in RANGES.items():
+            if (value := getattr(self, name)) is not None:
+                check_amount(name, value, possible)
         for name, fits, wanted in self._checks():
             if not fits:
                 raise UserError(f"{name} is {getattr(self, name)}: choose {wanted}")
 
     def _checks(self) -> Iterator[tuple[str, bool, str]]:
-        """Yield (field, whether it fits with the others, what would)."""
-        x_m, v_mps = self.x_pov0_m, self.v_pov0_mps
-        slow_mps, fast_mps = self.bounds("v_vut0_mps")
-        before = f"metres before M, -{self.reach_m:g} to 0, low < high"
-        speeds = f"between 0 and {self.v_start_max_mps:g}, low < high"
-        yield "x_pov0_m", -self.reach_m <= x_m[0] < x_m[1] <= 0.0, before
-        yield "v_pov0_mps", 0.0 <= v_mps[0] < v_mps[1] <= self.v_start_max_mps, speeds
-        is_range = slow_mps < fast_mps or not isinstance(self.v_vut0_mps, tuple)
-        fits = 0.0 <= slow_mps <= fast_mps <= self.v_start_max_mps
-        yield "v_vut0_mps", fits and is_range, speeds
+        """Yield (field, whether it fits the others, values that fit)."""
+        near = f"starts up to reach_m, {self.reach_m:g} m, before M"
+        yield "headway_behind_s", self.farthest_start_m <= self.reach_m, near
+        for name in ("x_pov0_m", "x_vut0_m"):
+            yield name, -self.reach_m <= self.bounds(name)[0], near
+        speeds = f"speeds up to v_start_max_mps, {self.v_start_max_mps:g}"
+        for name in ("v_pov0_mps", "v_vut0_mps"):
+            yield name, self.bounds(name)[1] <= self.v_start_max_mps, speeds
         has_both = (self.headway_ahead_s is None) == (self.headway_behind_s is None)
         yield "headway_behind_s", has_both, "both headways, or none"
-        shortest_s = (self.pov_length_m + self.min_gap_m) / max(v_mps[0], 1e-9)
-        apart = f"low < high, from {shortest_s:.2f} up: else cars overlap at {v_mps[0]:g} m/s"
+        slowest_mps = self.v_pov0_mps[0]
+        shortest_s = (self.pov_length_m + self.min_gap_m) / max(slowest_mps, 1e-9)
+        apart = f"{shortest_s:.2f} or more: else cars overlap at {slowest_mps:g} m/s"
         for name in ("headway_ahead_s", "headway_behind_s"):
             headway_s = getattr(self, name)
-            yield name, headway_s is None or shortest_s <= headway_s[0] < headway_s[1], apart
-        near = f"headways that start no car more than reach_m, {self.reach_m:g} m, before M"
-        yield "headway_behind_s", self.farthest_start_m <= self.reach_m, near
+            yield name, headway_s is None or shortest_s <= headway_s[0], apart
         begin_m, end_m = self.lane_m or (0.0, 1.0)
         around = "[begin, end] of the lane: begin from x_vut0_m to 0, end above 0"
-        yield "x_vut0_m", -self.reach_m <= self.x_vut0_m < 0.0, before
         yield "lane_m", self.x_vut0_m <= begin_m <= 0.0 < end_m, around
-        yield "a_min_mps2", self.a_min_mps2 < 0.0, "below 0"
+        for name in ("x_vut0_m", "a_min_mps2"):
+            yield name, getattr(self, name) < 0.0, "below 0"
         for name in ("a_max_mps2", "v_min_mps", "ttc_min_s", "level0_v_mps"):
             yield name, getattr(self, name) > 0.0, "above 0"
         yield "v_hw_min_mps", 0.0 < self.v_hw_min_mps < self.v_hw_max_mps, "below v_hw_max_mps"
@@ -316,103 +350,116 @@ class Scenario:
         yield "level0_a_mps2", 0.0 < self.level0_a_mps2 <= self.a_max_mps2, "up to a_max_mps2"
 
     def to_record(self) -> dict[str, Any]:
-        """Return the scenario as JSON keeps it, without perfect sensing and without a lane."""
-        record = asdict(self)
-        for name, imperfection in ((SENSE, self.sense), (ACT, self.act)):
-            del record[name]
-            if imperfect := imperfection.to_record():
-                record[name] = imperfect
+        """Return the scenario for JSON: its fields, without perfect parts and an unused lane."""
+        record = asdict(self) | {SENSE: self.sense.to_record(), ACT: self.act.to_record()}
+        for name in (SENSE, ACT, "lane_m"):
+            if not record[name]:
+                del record[name]
         if self.lane_m is None:
-            del record["lane_m"], record["lane_end"]
+            del record["lane_end"]
         return record
 
     @property
     def criterion(self) -> str:
-        """The criterion of a campaign that names none; the paper's is not for a lane."""
+        """Default criterion of a campaign; that of the paper does not know lanes."""
         return "paper" if self.lane_m is None else "unsafe"
 
     @property
     def goal(self) -> str:
-        """Words for the place that the VUT must reach before the timeout."""
+        """Place in words that the VUT must reach before the timeout."""
         return "the merge point" if self.lane_m is None else "the mainline"
 
     @property
     def place(self) -> str:
-        """M; on an acceleration lane, where M is only expected, the merge."""
+        """Name of the place of the merge: M, or "the merge" on an acceleration lane."""
         return "M" if self.lane_m is None else "the merge"
 
     def wording(self, text: str) -> str:
-        """Return a text with M, where M is only expected with "the merge" in its place."""
-        if self.lane_m is None:
-            return text
+        """Return a text with `place` for the word M.
+
+        Args:
+            text: a sentence about M.
+        """
         return re.sub(r"\bM\b", self.place, text)
 
     def bounds(self, name: str) -> Bounds:
-        """Return the bounds of a number that may be a range: both are the number if it is not."""
+        """Return lowest and highest value of a number that may be a range.
+
+        Args:
+            name: field of the number.
+        """
         value = getattr(self, name)
         return value if isinstance(value, tuple) else (value, value)
 
     @property
     def vehicles(self) -> int:
-        """A: how many vehicles an episode has, the VUT among them."""
+        """Number A of the vehicles of an episode, with the VUT."""
         return 2 if self.headway_ahead_s is None else len(VEHICLES)
 
     @property
     def lengths_m(self) -> tuple[float, float]:
-        """Length of a car of the mainline, and of the VUT."""
+        """Length of a car of the mainline, and of the VUT, in m."""
         return self.pov_length_m, self.vut_length_m
 
     @property
     def farthest_start_m(self) -> float:
-        """Distance to M of the farthest start on the mainline."""
+        """Distance of the farthest start on the mainline to M, in m."""
         behind_s = 0.0 if self.headway_behind_s is None else self.headway_behind_s[1]
         return behind_s * self.v_pov0_mps[1] - self.x_pov0_m[0]
 
     @property
     def max_steps(self) -> int:
-        """Steps after which an episode that has not ended is a TIMEOUT."""
+        """Number of steps until the timeout."""
         return round(self.timeout_s / DT_S)
 
     @property
     def room_after_m(self) -> float:
-        """How far after M a POV may get until the timeout, at full acceleration."""
+        """Length of the road after M that a POV may need until the timeout, in m."""
         far_m = self.v_start_max_mps * self.timeout_s + 0.5 * self.a_max_mps2 * self.timeout_s**2
         ahead_m = self.reach_m if self.vehicles > 2 else 0.0
         return max(far_m, ROOM_AFTER_M) + ahead_m
 
     def dimensions(self, level: int) -> tuple[Coordinate, ...]:
-        """Return the continuous coordinates of the pool at a level: those that have a range.
+        """Return the coordinates of the pool at a level, with their bounds.
 
-        At level 2 the POV's orientation is the last one.
+        Args:
+            level: level of the POV. At level 2 the orientation is the last coordinate.
         """
         ranges = []
         for coordinate in COORDINATES:
-            owner, field = self, coordinate.field
-            if coordinate in IMPERFECTIONS:
-                part, _, field = field.partition("_")
-                owner = getattr(self, part)
-            value = getattr(owner, field)
+            value = self._amount(coordinate)
             if isinstance(value, tuple):
                 ranges.append(replace(coordinate, low=value[0], high=value[1]))
         return (*ranges, SVO) if level == 2 else tuple(ranges)
 
     @property
     def imperfect_fields(self) -> tuple[str, ...]:
-        """Fields of a case that are ranges of `sense` and `act`."""
-        fields = (coordinate.field for coordinate in self.dimensions(0))
-        return tuple(field for field in fields if field.startswith((SENSE, ACT)))
+        """Fields of a case for the ranges of `sense` and `act`."""
+        ranges = [c.field for c in IMPERFECTIONS if isinstance(self._amount(c), tuple)]
+        return tuple(ranges)
+
+    def _amount(self, coordinate: Coordinate) -> Any:
+        """Return the number or the range of a coordinate."""
+        part, _, name = coordinate.field.partition("_")
+        if part in (SENSE, ACT):
+            return getattr(getattr(self, part), name)
+        return getattr(self, coordinate.field)
 
     @property
     def case_fields(self) -> tuple[str, ...]:
-        """Fields of a case, without its level, that are its place in the scenario."""
+        """Fields of a case that a record names, except its level."""
         headways = ("headway_ahead_s", "headway_behind_s") if self.vehicles > 2 else ()
         own = ("x_pov0_m", "v_pov0_mps", "v_vut0_mps", "svo_rad")
         return (*own, *headways, *self.imperfect_fields)
 
     def has_ended(self, x_m: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Return in which corridors the VUT has to be on the mainline in positions (A, K), (K,).
+        """Return whether the VUT has passed M, or the end of the acceleration lane.
 
-        It is there from M on, or from the end of the acceleration lane on.
+        Args:
+            x_m: positions, (A, K).
+
+        Returns:
+            For each corridor, (K,).
         """
         end_m = 0.0 if self.lane_m is None else self.lane_m[1]
         arrived: NDArray[np.bool_] = x_m[VUT] >= end_m
@@ -420,27 +467,38 @@ class Scenario:
 
 
 US23 = Scenario()
-"""The paper's."""
+"""Scenario of the paper."""
 
 
 @dataclass(frozen=True, slots=True)
 class Units:
-    """The size of a scenario relative to the paper's, of which all units are 1.
+    """Size of a scenario as multiples of the paper's.
 
-    A driver that measures in these units sees the same numbers in similar merges. Where lengths,
-    speeds and accelerations are all the same multiple of the paper's, all else is equal, to the
-    last bit if that is a power of two.
+    A learned driver measures in these units, so that similar merges look alike. Where lengths,
+    speeds and accelerations are the same multiple of the paper's, its inputs are equal, to the last
+    bit for a power of two.
+
+    Attributes:
+        length: distance of the VUT to M at the start.
+        speed: speed of the VUT at M on the level-0 profile.
+        time: time for that distance at that speed.
+        gap: gap below which two vehicles collide.
+        acceleration: hardest acceleration.
     """
 
-    length: float  # of the way of the VUT to M
-    speed: float  # of the VUT at M, on the level-0 profile
-    time: float  # that such a way takes at such a speed
-    gap: float  # of the gap below which two vehicles collide
-    acceleration: float  # of the hardest acceleration
+    length: float
+    speed: float
+    time: float
+    gap: float
+    acceleration: float
 
     @classmethod
     def of(cls, scenario: Scenario) -> Self:
-        """Return the units of a scenario."""
+        """Return the units of a scenario.
+
+        Args:
+            scenario: the scenario.
+        """
         length = scenario.x_vut0_m / US23.x_vut0_m
         speed = scenario.level0_v_mps / US23.level0_v_mps
         return cls(

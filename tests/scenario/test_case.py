@@ -43,11 +43,11 @@ def test_points_and_cases_are_inverse_to_each_other(level, coordinates):
         ({"level": 4}, "level is 4"),
         ({"svo_rad": 0.5}, "svo_rad belongs to level 2"),
         ({"level": 2}, "svo_rad belongs to level 2"),
-        ({"level": 2, "svo_rad": 2.0}, "svo_rad is 2.0"),
-        ({"x_pov0_m": 5.0}, "x_pov0_m is 5.0"),
+        ({"level": 2, "svo_rad": 2.0}, "svo_rad is 2: choose 0 to"),
+        ({"x_pov0_m": 5.0}, "x_pov0_m is 5: choose -900 to 0"),
         ({"x_pov0_m": math.nan}, "x_pov0_m is nan"),
-        ({"v_pov0_mps": -1.0}, "v_pov0_mps is -1.0"),
-        ({"v_vut0_mps": 46.0}, "v_vut0_mps is 46.0"),
+        ({"v_pov0_mps": -1.0}, "v_pov0_mps is -1: choose"),
+        ({"v_vut0_mps": 46.0}, "v_vut0_mps is 46: choose 0 to 45"),
     ],
 )
 def test_a_case_that_is_no_scenario_is_refused_with_a_sentence(change, sentence):
