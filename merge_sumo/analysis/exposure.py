@@ -1,4 +1,4 @@
-"""The distribution of cases: a distribution of each coordinate, or a measured traffic.
+"""The distribution of cases: that of each coordinate, or a measured traffic.
 
 A traffic states the density and the speeds of the mainline, with a source:
 
@@ -46,26 +46,55 @@ class _Shape(Record, frozen=True):
 
     @abstractmethod
     def law(self, low: float, high: float) -> Any:
-        """Return the distribution of scipy, before it is cut off at bounds."""
+        """Return the distribution of scipy, before it is cut off.
+
+        Args:
+            low: lower bound, in the unit of the coordinate.
+            high: upper bound.
+
+        Raises:
+            UserError: for wrong edges or weights of a histogram.
+        """
 
     def ends(self, low: float, high: float) -> tuple[float, float]:
-        """Return the probabilities to be below each of two bounds."""
+        """Return the probabilities to be below each of two bounds.
+
+        Args:
+            low: lower bound, in the unit of the coordinate.
+            high: upper bound.
+        """
         below, up_to = self.law(low, high).cdf([low, high]).tolist()
         return below, up_to
 
     def quantiles(self, d: Coordinate, chances: FloatArray) -> FloatArray:
-        """Return the values, (n,), at chances, (n,), in the unit of a coordinate."""
+        """Return values of a coordinate, (n,), in its unit.
+
+        Args:
+            d: the coordinate.
+            chances: probabilities to be below the values, (n,).
+        """
         low, high = self.bounds(d)
         below, up_to = self.ends(low, high)
         values = self.law(low, high).ppf(below + chances * (up_to - below))
         return np.clip(np.asarray(values, dtype=np.float64), low, high)
 
     def bounds(self, d: Coordinate) -> tuple[float, float]:
-        """Return the bounds at which it is cut off."""
+        """Return the bounds at which it is cut off, in the unit of a coordinate.
+
+        Args:
+            d: the coordinate.
+        """
         return d.low if self.low is None else self.low, d.high if self.high is None else self.high
 
     def check(self, d: Coordinate) -> None:
-        """Raise `UserError` where it is not within the pool, or has no probability there."""
+        """Check that the distribution is within the pool.
+
+        Args:
+            d: the coordinate.
+
+        Raises:
+            UserError: where it is not, or has no probability there.
+        """
         low, high = self.bounds(d)
         if not d.low <= low < high <= d.high:
             raise UserError(
@@ -88,7 +117,12 @@ class Uniform(_Shape, frozen=True, tag_field="kind", tag="uniform"):
 
 
 class Normal(_Shape, frozen=True, kw_only=True, tag_field="kind", tag="normal"):
-    """A normal distribution."""
+    """A normal distribution, cut off at the bounds.
+
+    Attributes:
+        mean: its mean before it is cut off, in the unit of the coordinate.
+        sd: its standard deviation, likewise.
+    """
 
     mean: float
     sd: Annotated[float, Meta(ge=1e-3, le=1e3)]
@@ -101,13 +135,18 @@ class Normal(_Shape, frozen=True, kw_only=True, tag_field="kind", tag="normal"):
 
 
 class Histogram(_Shape, frozen=True, kw_only=True, tag_field="kind", tag="histogram"):
-    """Weights of bins between rising edges, uniform within a bin."""
+    """A distribution that is uniform within each of n bins.
+
+    Attributes:
+        edges: edges of the bins, rising, (n + 1,), in the unit of the coordinate.
+        weights: weights of the bins, (n,).
+    """
 
     edges: tuple[float, ...]
     weights: Weights
 
     def law(self, low: float, high: float) -> Any:
-        """Return the distribution of scipy; `UserError` for wrong edges or weights."""
+        """Return the distribution of scipy."""
         from scipy.stats import rv_histogram
 
         edges, weights = np.array(self.edges), self.weights
@@ -143,7 +182,12 @@ class Distribution:
     scenario: Scenario
 
     def points(self, level: int, chances: FloatArray) -> FloatArray:
-        """Return points of the unit cube, (n, d), at chances, (n, d): uniform ones are a sample."""
+        """Return points of the unit cube, (n, d).
+
+        Args:
+            level: level of the POV.
+            chances: quantiles of the coordinates, (n, d); uniform ones give a sample.
+        """
         columns = []
         for d, chance in zip(self.scenario.dimensions(level), chances.T, strict=True):
             values = self.marginals[d.field].quantiles(d, chance)
@@ -156,7 +200,9 @@ class Distribution:
         return {"levels": levels, **to_plain(self.marginals)}
 
 
-def read_distribution(path: Path | None, levels: Sequence[int], scenario: Scenario) -> Distribution:
+def read_distribution(
+    path: Path | str | None, levels: Sequence[int], scenario: Scenario
+) -> Distribution:
     """Return the distribution in a JSON file, cut off at the pool's bounds.
 
     The file has weights of levels and one entry for each coordinate; missing ones are uniform:
@@ -180,7 +226,7 @@ def read_distribution(path: Path | None, levels: Sequence[int], scenario: Scenar
     kind = record_type("distribution", [("levels", ByLevel, {}), *fields])
     marginals = {}
     try:
-        content = kind() if path is None else decode(path.read_bytes(), kind)
+        content = kind() if path is None else decode(Path(path).read_bytes(), kind)
         for d in coordinates:
             marginals[d.field] = getattr(content, d.field)
             marginals[d.field].check(d)
@@ -205,7 +251,7 @@ def read_distribution(path: Path | None, levels: Sequence[int], scenario: Scenar
 FOLDER = Path(__file__).resolve().parent / "traffics"
 SUFFIX = ".toml"
 LEAST_SPEEDS = 0.01
-"""Minimum share of the speeds of a traffic within a pool."""
+"""Minimum share of the speeds of a traffic that must be within the pool."""
 
 
 class Traffic(Record, frozen=True):
@@ -215,8 +261,8 @@ class Traffic(Record, frozen=True):
         cars_per_merge = named_traffic("exid-5").cars_in_pool(US23)
 
     Attributes:
-        source: source of the figures.
-        speeds: distribution of the speeds of cars on the lane next to the ramp, m/s.
+        source: source of its figures.
+        speeds: distribution of the speeds of cars on the lane next to the ramp, in m/s.
         density_veh_per_km: cars per kilometre of that lane, before the ramp meets it; 1,000 would
             be cars of a metre without gaps.
         name: name of its file.
@@ -229,6 +275,9 @@ class Traffic(Record, frozen=True):
 
     def share_in_pool(self, scenario: Scenario) -> float:
         """Return the share of the speeds within the pool of a scenario.
+
+        Args:
+            scenario: the scenario.
 
         Raises:
             UserError: where the scenario has several cars on the mainline, or the pool hardly any
@@ -251,6 +300,10 @@ class Traffic(Record, frozen=True):
     def in_pool(self, scenario: Scenario, levels: Sequence[int]) -> Distribution:
         """Return the distribution of the cases of a scenario: positions and psi are uniform.
 
+        Args:
+            scenario: the scenario.
+            levels: levels of the cases.
+
         Raises:
             UserError: as `share_in_pool`.
         """
@@ -259,7 +312,11 @@ class Traffic(Record, frozen=True):
         return replace(uniform, marginals={**uniform.marginals, "v_pov0_mps": self.speeds})
 
     def cars_in_pool(self, scenario: Scenario) -> float:
-        """Return the number of cars of the mainline per merge that start in the pool."""
+        """Return the number of cars of the mainline per merge that start in the pool.
+
+        Args:
+            scenario: the scenario of the pool.
+        """
         low_m, high_m = scenario.x_pov0_m
         return self.density_veh_per_km / 1000.0 * (high_m - low_m) * self.share_in_pool(scenario)
 
@@ -270,7 +327,14 @@ def shipped_traffics() -> list[str]:
 
 
 def named_traffic(name: str) -> Traffic:
-    """Return the traffic of a name or of a TOML file; `UserError` where there is none."""
+    """Return a traffic of the package, or that of a TOML file.
+
+    Args:
+        name: name of the traffic, or path of the file.
+
+    Raises:
+        UserError: where no such traffic exists, or the file is no traffic.
+    """
     known, path = shipped_traffics(), Path(name)
     if name in known:
         path = FOLDER / f"{name}{SUFFIX}"

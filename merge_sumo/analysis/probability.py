@@ -1,4 +1,4 @@
-"""How likely a VUT is to fail under a distribution over the pool, with an exact interval.
+"""The failure probability of a VUT under a distribution over the pool, with an exact interval.
 
 Fresh cases are drawn from where a campaign expects failures, and from where it expects none.
 """
@@ -55,13 +55,13 @@ STREAM = 7
 CELLS = 16_384
 """Maximum number of cells of a level."""
 EXPECTED = 0.5
-"""Chance to fail from which the surrogate expects a failure."""
+"""Failure probability of the surrogate from which a failure is expected."""
 EXPECTED_LEAST = 0.25
 """Least share of the cases for the stratum where failures are expected, if there is one: it is
-small, and nearly all of the variance is in it. If the surrogate knows nothing, that costs 15 % of
-the width."""
+small, and nearly all of the variance is in it. With a surrogate that knows nothing the interval
+becomes 15 % wider."""
 NAMED = 20
-"""Failures where none was expected that the result names."""
+"""Maximum number of unexpected failures that the result names."""
 
 
 class Stratum(Record, frozen=True):
@@ -70,11 +70,12 @@ class Stratum(Record, frozen=True):
     Attributes:
         expects_failures: whether the campaign expects failures in it.
         share: probability of a case in it.
-        cases: fresh cases.
-        failures: those of them that fail.
-        without_verdict: those without a verdict: errors, and timeouts that are not failures.
-        low: lower end of the interval of the share that fails, with these as safe.
-        high: upper end, with these as failures.
+        cases: number of fresh cases.
+        failures: number of those that fail.
+        without_verdict: number of those without a verdict: errors, and timeouts that are not
+            failures.
+        low: lower end of the interval of the share that fails; cases without a verdict are safe.
+        high: upper end; cases without a verdict are failures.
     """
 
     expects_failures: bool
@@ -87,13 +88,13 @@ class Stratum(Record, frozen=True):
 
 
 class Estimate(Record, frozen=True):
-    """A probability of failure; each interval holds with the confidence of the result.
+    """A failure probability with its interval.
 
     Attributes:
         probability: the estimate; cases without a verdict count as safe.
-        low: lower end of its interval.
+        low: lower end of its interval, which holds with the confidence of the result.
         high: upper end.
-        strata: the one without expected failures, and the one with them where there is one.
+        strata: the stratum without expected failures, then that with them; one may be missing.
     """
 
     probability: float
@@ -107,11 +108,11 @@ class PerMerge(Record, frozen=True):
 
     Attributes:
         traffic: the traffic.
-        cars: mainline cars per merge that are counted: those that start in the pool.
+        cars: number of counted cars of the mainline per merge: those that start in the pool.
         counted_speeds: share of the traffic's speeds that are in the pool.
         least: failures per merge for the mixture of levels with the fewest.
-        most: for that with the most.
-        low: lower end of the interval, which holds the failures per merge of every mixture.
+        most: failures per merge for the mixture with the most.
+        low: lower end of the interval for all mixtures.
         high: upper end.
     """
 
@@ -125,24 +126,24 @@ class PerMerge(Record, frozen=True):
 
 
 class ProbabilityResult(Result, Record, frozen=True):
-    """How likely a VUT is to fail.
+    """The failure probability of a VUT.
 
     Example:
         found = ms.probability("runs/latest", cases=4000)
         assert found.overall.high < 0.01
 
     Attributes:
-        overall: over the levels as they were weighed; None where a traffic has no weights of them.
-        levels: by level.
+        overall: over the weighed levels; None with a traffic, which has no weights of levels.
+        levels: the estimate of each level.
         per_merge: failures per merge; None without a traffic.
-        confidence: chance that an interval holds.
-        cases: fresh cases.
-        in_sumo: those that ran in SUMO.
-        missed: failures that were not expected, by level and coordinates, at most `NAMED`.
-        distribution: how often cases occur.
-        seed: of the draws.
-        engine: what moved the vehicles.
-        campaign: settings of the campaign.
+        confidence: probability with which an interval holds.
+        cases: number of fresh cases.
+        in_sumo: number of those that ran in SUMO.
+        missed: level and coordinates of unexpected failures, at most `NAMED`.
+        distribution: the distribution of the cases, as in a file.
+        seed: seed of the draws.
+        engine: the engine that moved the vehicles.
+        campaign: settings, versions and hashes, as in `campaign.json`.
     """
 
     overall: Estimate | None
@@ -159,7 +160,7 @@ class ProbabilityResult(Result, Record, frozen=True):
 
     @property
     def without_verdict(self) -> int:
-        """Number of cases that are not judged."""
+        """Number of cases without a verdict."""
         number = 0
         for level in self.levels.values():
             number += sum(one.without_verdict for one in level.strata)
@@ -167,7 +168,7 @@ class ProbabilityResult(Result, Record, frozen=True):
 
     @property
     def is_judged(self) -> bool:
-        """Whether any case is judged: else no probability can be stated."""
+        """Whether any case has a verdict: otherwise the probability is not known."""
         return self.without_verdict < self.cases
 
 
@@ -191,7 +192,14 @@ class Cells(NamedTuple):
 
 
 class Counted(NamedTuple):
-    """Cells, and the results of the cases that were drawn from them."""
+    """The results of the cases that were drawn from cells.
+
+    Attributes:
+        cells: the cells.
+        cases: number of cases.
+        failures: number of those that fail.
+        without_verdict: number of those without a verdict.
+    """
 
     cells: Cells
     cases: int
@@ -202,7 +210,7 @@ class Counted(NamedTuple):
 def failure_probability(
     study: RunStudy, options: config.Probability, out: Path
 ) -> ProbabilityResult:
-    """Estimate how likely the VUT of a campaign is to fail, with fresh cases; write it to a file.
+    """Estimate the failure probability of the VUT of a campaign with fresh cases, and write it.
 
     Args:
         study: the study of the campaign.
@@ -222,9 +230,7 @@ def failure_probability(
         raise UserError("choose a distribution or a traffic: a traffic states its own")
     check_new(out, endings=(".json",))
     study.check_same_system()
-    traffic = None
-    path = None if options.distribution is None else Path(options.distribution)
-    distribution = read_distribution(path, levels, scenario)
+    traffic, distribution = None, read_distribution(options.distribution, levels, scenario)
     if options.traffic is not None:
         traffic = named_traffic(str(options.traffic))
         distribution = traffic.in_pool(scenario, levels)
@@ -268,7 +274,12 @@ def failure_probability(
 
 
 def expected_cells(study: RunStudy, distribution: Distribution) -> list[Cells]:
-    """Return the cells of each level, by whether the campaign expects failures in them."""
+    """Return the cells of each level and stratum.
+
+    Args:
+        study: the campaign, with whose outcomes a surrogate is learned.
+        distribution: the distribution of cases: cells are equally likely under it.
+    """
     found = []
     for level, weight in distribution.levels.items():
         shape = cells_of(distribution.scenario, level)
@@ -287,7 +298,12 @@ def expected_cells(study: RunStudy, distribution: Distribution) -> list[Cells]:
 
 
 def cells_of(scenario: Scenario, level: int) -> tuple[int, ...]:
-    """Return the number of cells along each coordinate of a level."""
+    """Return the number of cells along each coordinate.
+
+    Args:
+        scenario: the scenario.
+        level: level of the POV.
+    """
     dims = len(scenario.dimensions(level))
     return (int(CELLS ** (1.0 / dims) + 1e-9),) * dims
 
@@ -295,16 +311,16 @@ def cells_of(scenario: Scenario, level: int) -> tuple[int, ...]:
 def draw(
     cells: Sequence[Cells], scenario: Scenario, cases: int, rng: np.random.Generator
 ) -> list[FloatArray]:
-    """Draw independent cases of each stratum, as often as they occur in it.
+    """Draw independent cases of each stratum.
 
     Args:
-        cells: cells of each stratum.
+        cells: the cells of each level and stratum.
         scenario: scenario of the cases.
         cases: number of cases in all.
         rng: random generator.
 
     Returns:
-        For each of the cells places in the distribution, (n, d), uniform in the unit cube.
+        The cases drawn from each of `cells`, as quantiles of the distribution, (n, d).
     """
     expected = sum(one.share for one in cells if one.expects_failures)
     if 0.0 < expected < 1.0 - 1e-9:
@@ -323,22 +339,29 @@ def draw(
 
 
 def estimate(counted: Sequence[Counted], confidence: float) -> Estimate:
-    """Return the estimate of the share of failures among the cases of some cells."""
-    sums: dict[bool, FloatArray] = {}
-    whole = 0.0
-    for one in counted:
-        numbers = np.array([one.cells.share, one.cases, one.failures, one.without_verdict])
-        key = one.cells.expects_failures
-        sums[key] = sums.get(key, np.zeros(4)) + numbers
-        whole += one.cells.share
-    of_stratum = 1.0 - (1.0 - confidence) / len(sums)
+    """Return the estimate of the share of failures among the cases of some cells.
+
+    Args:
+        counted: the results of the cells.
+        confidence: probability with which the interval holds.
+    """
+    whole = sum(one.cells.share for one in counted)
+    groups = []
+    for expects_failures in (False, True):
+        group = [one for one in counted if one.cells.expects_failures == expects_failures]
+        if group:
+            groups.append(group)
+    of_stratum = 1.0 - (1.0 - confidence) / len(groups)
     probability = low = high = 0.0
     strata = []
-    for expects_failures in sorted(sums):
-        share, *counts = (sums[expects_failures] / (whole, 1, 1, 1)).tolist()
-        cases, failures, unjudged = map(int, counts)
+    for group in groups:
+        share = sum(one.cells.share for one in group) / whole
+        cases = sum(one.cases for one in group)
+        failures = sum(one.failures for one in group)
+        unjudged = sum(one.without_verdict for one in group)
         one_low, _ = clopper_pearson(failures, cases, of_stratum)
         _, one_high = clopper_pearson(failures + unjudged, cases, of_stratum)
+        expects_failures = group[0].cells.expects_failures
         strata.append(
             Stratum(expects_failures, share, cases, failures, unjudged, one_low, one_high)
         )
@@ -349,10 +372,10 @@ def estimate(counted: Sequence[Counted], confidence: float) -> Estimate:
 
 
 def _per_merge(traffic: Traffic, scenario: Scenario, levels: dict[int, Estimate]) -> PerMerge:
-    """Return the range over mixtures of levels.
+    """Return the failures per merge for all mixtures of levels.
 
-    Its low end is above the fewest only where the end of that level is, and its high end below the
-    most likewise; so all mixtures are inside with the confidence of a level.
+    The interval goes from the lowest end of a level to the highest. It fails for some mixture only
+    where that of the least or of the most likely level fails, so it has the confidence of a level.
     """
     cars = traffic.cars_in_pool(scenario)
     ends = [(one.probability, one.low, one.high) for one in levels.values()]
