@@ -1,4 +1,4 @@
-"""Cases in a small file to commit, with which they run elsewhere; it names no code."""
+"""Cases files: cases of a campaign in a small file to commit, with all that they need to run."""
 
 from __future__ import annotations
 
@@ -24,10 +24,19 @@ from merge_sumo.scenario.trajectory import End
 from merge_sumo.simulation.povs import POLICIES
 
 TOLERANCE = 0.01
+"""Loss of margin that is not yet worse, without a unit."""
 
 
 class Head(Record, frozen=True):
-    """The content of a cases file, by the names of `campaign.json`, with a record a case."""
+    """The content of a cases file.
+
+    Attributes:
+        scenario: name of the scenario, and its values other than the defaults.
+        cases: a record for each case, by the names of `outcomes.jsonl`.
+        tolerance: loss of margin that is not yet worse.
+
+    The other attributes have the names and values of `campaign.json`.
+    """
 
     vut: str
     scenario: dict[str, Any]
@@ -43,7 +52,7 @@ class Head(Record, frozen=True):
 
 
 class CasesFile(RecordedCampaign):
-    """A cases file, as a campaign of which only what decided its cases is recorded.
+    """A cases file, as a recorded campaign.
 
     Example:
         kept = CasesFile(Path("cases.toml"))
@@ -108,7 +117,14 @@ class CasesFile(RecordedCampaign):
             self.accepted[outcome.index] = accepted
 
     def outcome(self, index: int) -> Outcome:
-        """Return the outcome of a case; `UserError` when the file has no such case."""
+        """Return the outcome of a case.
+
+        Args:
+            index: index of the case.
+
+        Raises:
+            UserError: where the file has no such case.
+        """
         if index not in self._by_index:
             raise UserError(f"{self.folder} has no case {index}")
         return self._by_index[index]
@@ -116,7 +132,10 @@ class CasesFile(RecordedCampaign):
     def change_of(self, one: ComparedCase) -> Change:
         """Return the change of a case by the rules of the file.
 
-        It accepts neither a new error nor a new contact.
+        A new error is `BROKE` and a new contact `WORSE`, also where the case is accepted.
+
+        Args:
+            one: the case, with its outcome in the file as the earlier one.
         """
         earlier, later = one.earlier.measures, one.later.measures
         if later.error is not None and earlier.error is None:
@@ -139,14 +158,26 @@ def short(value: Any) -> Any:
 
 
 def verdict_of(outcome: Outcome) -> str:
-    """Return the verdict on a case in a word."""
+    """Return the verdict on a case: pass, fail, error, or timeout.
+
+    Args:
+        outcome: the outcome of the case.
+    """
     if outcome.is_tested:
-        return "fail" if outcome.failed else "pass"
+        return "pass" if outcome.passes else "fail"
     return "error" if outcome.measures.end.is_error else "timeout"
 
 
 def policies_of(run: RecordedCampaign, outcomes: Iterable[Outcome]) -> dict[str, str] | None:
-    """Return the hashes of the learned POVs of some cases, as a campaign records them."""
+    """Return the hashes of the learned POVs of some cases, by the names of the networks.
+
+    Args:
+        run: the campaign, which has recorded them.
+        outcomes: outcomes of the cases.
+
+    Returns:
+        The hashes; None where no learned POV drives in the cases.
+    """
     learned = {POLICIES.get(outcome.case.level) for outcome in outcomes}
     known = run.record.get("policies_sha256") or {}
     return {name: sha256 for name, sha256 in known.items() if name in learned} or None

@@ -6,14 +6,12 @@ Cases that both versions ran are paired; where each has cases of its own, shares
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Container, Iterable, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from functools import cached_property
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from merge_sumo.campaigns.printed_commands import command
 from merge_sumo.campaigns.recorded import RecordedCampaign
@@ -41,9 +39,6 @@ SIGNIFICANT = 0.05
 PAGE = Path("changes.html")
 """The page with both motions that a command writes."""
 
-Motions = Callable[[Iterable[int]], Mapping[int, Trajectory]]
-"""Returns the recorded motions of cases by their index."""
-
 
 @dataclass(frozen=True)
 class Version:
@@ -54,7 +49,7 @@ class Version:
         folder: folder of its campaign; None where it ran the cases of another version's campaign.
         outcomes: its outcomes, one for each run of a case.
         tolerated: share of its runs in which a case may fail, 0 to 1.
-        motions: returns its motions by the indices of cases.
+        motion: returns the motion of a case by its index; None where it is lost.
         sampler: name of the sampler that chose its cases.
     """
 
@@ -62,7 +57,7 @@ class Version:
     folder: str | None
     outcomes: Sequence[Outcome]
     tolerated: float
-    motions: Motions
+    motion: Callable[[int], Trajectory | None]
     sampler: str
 
     @classmethod
@@ -77,7 +72,7 @@ class Version:
             folder=str(run.folder),
             outcomes=run.outcomes,
             tolerated=run.tolerated,
-            motions=run.trajectories,
+            motion=lambda index: run.trajectories([index]).get(index),
             sampler=run.settings.sampler,
         )
 
@@ -112,7 +107,6 @@ class Change(StrEnum):
     BOTH = "pass with both"
 
 
-ORDER = list(Change)
 GOT_WORSE = (Change.BROKE, Change.WORSE)
 
 
@@ -210,8 +204,7 @@ def fisher(one: tuple[int, int], other: tuple[int, int]) -> float:
     """
     from scipy.stats import fisher_exact
 
-    table = np.array((one, other))
-    table[:, 1] -= table[:, 0]
+    table = [(part, whole - part) for part, whole in (one, other)]
     return float(fisher_exact(table)[1])
 
 
@@ -229,7 +222,7 @@ def in_order(cases: Iterable[ComparedCase]) -> list[ComparedCase]:
         cases: the cases, in any order.
     """
     return sorted(
-        cases, key=lambda c: (ORDER.index(c.change), c.later.margin or 0.0, c.later.index)
+        cases, key=lambda c: (list(Change).index(c.change), c.later.margin or 0.0, c.later.index)
     )
 
 

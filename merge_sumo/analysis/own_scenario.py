@@ -41,6 +41,9 @@ def shipped() -> Shown:
 def write_scenario(options: config.NewScenario) -> Shown:
     """Write a scenario for a merge in a net, and a picture of the road.
 
+    Args:
+        options: options of the verb.
+
     Raises:
         UserError: for a net without such a merge, and for files that exist.
     """
@@ -65,8 +68,8 @@ def check_scenario(scenario: Scenario, name: str, policies: Path | None) -> Show
 
     Args:
         scenario: the scenario.
-        name: its name.
-        policies: folder of the learned drivers, by default of the shipped ones.
+        name: its name or file, for commands.
+        policies: folder of the learned drivers; None for the shipped ones.
     """
     found = road_for(scenario)
     road, differing = about(found), unseen(scenario, policies)

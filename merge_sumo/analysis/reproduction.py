@@ -1,4 +1,4 @@
-"""The paper's results: Table II and the figures, with our numbers and the paper's.
+"""Reproduction of the paper: Table II and the figures, with our numbers and the paper's.
 
 Every number is the median over seeds; a picture of single cases is of the seed with the median.
 """
@@ -34,11 +34,11 @@ from merge_sumo.workers import Workers
 
 SAMPLERS = ("uniform", "annealing", "subset", "gpr", "coverage")
 ADAPTIVE = ("gpr", "coverage")
-"""The paper's sampler and ours, of which shares of the truth and of the levels are shown."""
+"""The paper's sampler and ours: their shares of the truth and of the levels are shown."""
 SURFACE_BATCHES = (1, 4, 13, 20)
-"""Batches after which the paper shows its surrogate."""
+"""Numbers of batches after which the paper shows its surrogate."""
 SURFACE_POINTS = 81
-"""Points of a surrogate's grid, in each direction."""
+"""Number of points of a surrogate's grid along each coordinate."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,7 +46,9 @@ class Column:
     """A column of Table II: a VUT against one POV level, and the numbers of the paper.
 
     Attributes:
-        paper: FMC of the truth and of each sampler that the paper has.
+        vut: spec of the VUT.
+        level: level of the POV.
+        paper: the paper's FMC of the truth and of each of its samplers, by name.
     """
 
     vut: str
@@ -74,10 +76,10 @@ class Scale:
     """The numbers of cases and seeds, by default those of the paper.
 
     Attributes:
-        seeds: runs of each sampler.
-        truth_cases: uniform cases of the truth at each level.
-        batches: k, the batches of every run.
-        batch: n, the cases per batch at one level; twice as many run where all levels do.
+        seeds: number of searches of each sampler.
+        truth_cases: number of uniform cases of the truth at levels 0, 1 and 2.
+        batches: number of batches of every search, k.
+        batch: number of cases of a batch at one level, n; twice as many where all levels run.
     """
 
     seeds: int = 10
@@ -87,11 +89,18 @@ class Scale:
 
 
 QUICK = Scale(seeds=2, truth_cases=(1000, 1000, 1000), batches=4, batch=15)
-"""The scale of a first look and of tests: it shows that all works, and no more."""
+"""The scale of a first look and of tests, too small for results."""
 
 
 def scale_of(options: config.Reproduce) -> Scale:
-    """Return the scale of the options; `UserError` for no seeds."""
+    """Return the scale of the options.
+
+    Args:
+        options: options of the verb.
+
+    Raises:
+        UserError: for no seeds.
+    """
     check_least(options, seeds=1)
     scale = QUICK if options.quick else Scale()
     return scale if options.seeds is None else replace(scale, seeds=options.seeds)
@@ -99,7 +108,12 @@ def scale_of(options: config.Reproduce) -> Scale:
 
 @dataclass(frozen=True, slots=True)
 class Panel:
-    """Cases at one level in the unit cube, (n, d), and which of them failed, (n,)."""
+    """Cases at one level.
+
+    Attributes:
+        points: the cases in the unit cube, (n, d).
+        failed: whether each failed, (n,).
+    """
 
     points: FloatArray
     failed: NDArray[np.bool_]
@@ -115,8 +129,9 @@ class PredictedMargins:
     """The predictions of a surrogate after a number of batches.
 
     Attributes:
-        margin: on a regular grid, (n, n), rows along v_POV0, columns along x_POV0.
-        learned: the cases that it has learned from.
+        margin: predicted margins on a regular grid, (n, n), rows along v_POV0, columns along
+            x_POV0.
+        learned: the cases from which the surrogate has learned.
     """
 
     margin: FloatArray
@@ -125,11 +140,11 @@ class PredictedMargins:
 
 @dataclass(frozen=True, slots=True)
 class LevelBatches:
-    """The batches of a sampler at each level, one row per seed, (seeds, batches).
+    """The batches of a sampler by level.
 
     Attributes:
-        cases: cases at the level in each batch.
-        margin: mean margin of them; NaN where there was none.
+        cases: number of cases of each batch, (seeds, batches).
+        margin: their mean margin, NaN where no case has one, (seeds, batches).
     """
 
     cases: Mapping[int, FloatArray]
@@ -138,7 +153,12 @@ class LevelBatches:
 
 @dataclass(frozen=True)
 class ColumnResult:
-    """A column that has run, and the study of its samplers at its level."""
+    """A column with our results.
+
+    Attributes:
+        column: the column.
+        study: the samplers in comparison, at the level of the column.
+    """
 
     column: Column
     study: SamplerStudy
@@ -153,7 +173,7 @@ class ColumnResult:
         return panels
 
     def predicted(self) -> dict[int, PredictedMargins]:
-        """Return the predictions of the surrogate of `gpr` after some batches, of one search."""
+        """Return the predictions of the surrogate of `gpr`, of one search, by number of batches."""
         searches, level = self.study.searches["gpr"], self.column.level
         seed = _median_seed(searches)
         axis = np.linspace(0.0, 1.0, SURFACE_POINTS)
@@ -174,13 +194,17 @@ class ColumnResult:
 class Reproduction(Result):
     """The results of the paper, and ours.
 
+    Example:
+        found = ms.reproduce(quick=True, out="reproduction")
+        print(found)
+
     Attributes:
         scale: the numbers of cases and seeds.
-        columns: those of Table II, by title.
-        levels: all levels together, by sampler.
-        policies_sha256: the POVs.
-        versions: the software.
-        page: the page that shows it, if it was written.
+        columns: the columns of Table II, by title.
+        levels: the batches of searches at all levels together, by sampler.
+        policies_sha256: hashes of the POV networks, by name.
+        versions: versions of the software, by name.
+        page: the page with the results; None where it was not written.
     """
 
     scale: Scale
@@ -264,13 +288,12 @@ def _level_batches(searches: Sequence[SamplerRun]) -> LevelBatches:
     cases, margin = {}, {}
     for level in LEVELS:
         cases[level] = np.zeros((len(searches), len(searches[0].fmc)))
-        margin[level] = np.full_like(cases[level], np.nan)
+        sums, known = np.zeros_like(cases[level]), np.zeros_like(cases[level])
         for seed, search in enumerate(searches):
-            at_level = [outcome for outcome in search.outcomes if outcome.case.level == level]
-            for batch in range(len(search.fmc)):
-                margins = [outcome.margin for outcome in at_level if outcome.batch == batch]
-                cases[level][seed, batch] = len(margins)
-                known = [one for one in margins if one is not None]
-                if known:
-                    margin[level][seed, batch] = np.mean(known)
+            for outcome in search.outcomes:
+                if outcome.case.level == level:
+                    cases[level][seed, outcome.batch] += 1
+                    known[seed, outcome.batch] += outcome.margin is not None
+                    sums[seed, outcome.batch] += outcome.margin or 0.0
+        margin[level] = sums / np.where(known > 0, known, np.nan)
     return LevelBatches(cases, margin)

@@ -84,9 +84,7 @@ def rerun(study: RunStudy, recorded: Sequence[Outcome]) -> Comparison:
         outcomes.append(episodes[outcome.index].outcome)
         motions[outcome.index] = episodes[outcome.index].trajectory
     earlier = replace(Version.of(run), outcomes=recorded)
-    later = replace(
-        earlier, vut=settings.vut, folder=None, outcomes=outcomes, motions=lambda _indices: motions
-    )
+    later = replace(earlier, vut=settings.vut, folder=None, outcomes=outcomes, motion=motions.get)
     source = (
         f"the cases come from the recorded search of {run.vut}; a campaign with `against` searches "
         "for cases that only the new version fails"

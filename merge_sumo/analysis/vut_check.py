@@ -1,4 +1,4 @@
-"""A short check of a VUT before a campaign: its faults, and the cost of a step."""
+"""A check of a VUT before a campaign: its faults, and the cost of a step."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from merge_sumo.simulation.plan import SimulationPlan
 from merge_sumo.simulation.simulator import Simulator
 
 CORRIDORS = 4
-"""Episodes that run at a time."""
+"""Number of episodes that run at a time."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True, repr=False)
@@ -41,12 +41,12 @@ class VutCheck(Result):
         assert found.ok, found.problems
 
     Attributes:
-        vut: the VUT.
+        vut: spec of the VUT.
         problems: sentences on faults that make results wrong or worthless.
         notes: other sentences for the author of the VUT.
-        us_per_step_median: cost of one step of one episode without SUMO, microseconds; None for a
-            VUT that does not start.
-        us_per_step_worst: cost of the slowest step.
+        us_per_step_median: time of one step of one episode without SUMO, in microseconds; None for
+            a VUT that does not start.
+        us_per_step_worst: time of the slowest step, likewise.
     """
 
     computed = ("ok",)
@@ -69,7 +69,11 @@ class VutCheck(Result):
 
 
 def check_vut(settings: CampaignSettings) -> VutCheck:
-    """Let a VUT drive a few cases, some of them again, and one from standstill."""
+    """Let a VUT drive a few cases, some of them again, and one from standstill.
+
+    Args:
+        settings: settings of a campaign with the VUT at level 0.
+    """
     problems: list[str] = []
     notes: list[str] = []
     cost_us: list[float] = []
@@ -146,7 +150,7 @@ def _ordinary_cases(scenario: Scenario) -> list[Case]:
 
 
 class _Timed(DriverWrapper):
-    """Measures the cost of a step of one corridor."""
+    """Measures the time of a step of one corridor."""
 
     def __init__(self, driver: Driver) -> None:
         super().__init__(driver)
@@ -172,7 +176,11 @@ def _differences(when: str, before: Sequence[Trajectory], after: Sequence[Trajec
 
 
 def known_vuts(policies: Path | str | None) -> Shown:
-    """Return the VUTs that can be tested, with the learned drivers of a folder or a library."""
+    """Return the VUTs that can be tested.
+
+    Args:
+        policies: folder or library of the learned drivers; None for the shipped ones.
+    """
     trained = read_manifest(policies_of(US23) if policies is None else policies_in(policies))
     built_in = [name for name, vut in BUILT_IN_VUTS.items() if vut.network in ("", *trained)]
     record: dict[str, Any] = {"built in": built_in, "installed": list(installed_vuts())}

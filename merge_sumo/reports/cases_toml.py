@@ -65,7 +65,7 @@ def with_file(compared: Comparison, file: CasesFile, path: Path) -> Comparison:
         index = one.later.index
         reason = file.accepted.get(index)
         if one.change in GOT_WORSE:
-            why = cause(one.later, now.motions([index]).get(index))
+            why = cause(one.later, now.motion(index))
             notes.append(f"case {index}, {one.change}: {why}")
         elif reason:
             result = "passes now: take the mark away" if one.later.passes else "fails, not counted"

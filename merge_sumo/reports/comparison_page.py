@@ -89,7 +89,7 @@ def _sections(version_change: VersionChange, compared: Comparison) -> list[tuple
                 ("later", version_change.number),
             ):
                 outcome, version = getattr(one, name), compared.versions[number - 1]
-                motion = version.motions([outcome.index]).get(outcome.index)
+                motion = version.motion(outcome.index)
                 versions.append((number, version.folder, outcome, cause(outcome, motion)))
                 if motion is not None:
                     motions[name] = motion.whole

@@ -158,7 +158,7 @@ def test_the_page_draws_both_motions_or_says_that_none_is_recorded(run):
         assert lines[::2] == lines[1::2], "the earlier motion of a car, then the later one"
         assert len(lines) == 8, "speeds and positions of two cars in two motions"
     for version in compared.versions:
-        object.__setattr__(version, "motions", lambda _: {})
+        object.__setattr__(version, "motion", lambda _: None)
     assert "No motion is recorded." in pages.comparison_page(compared)
 
 
