@@ -192,4 +192,4 @@ class _Host:
                 path = Path(file).resolve()
                 if path.is_file() and not any(map(path.is_relative_to, INSTALLED_FOLDERS)):
                     files.add(path)
-        return sorted(os.fsencode(file.resolve()) for file in files)
+        return sorted(map(os.fsencode, files))

@@ -69,26 +69,22 @@ class Seen(_State):
     _merged: bool = False
 
     @property
-    def vehicles(self) -> tuple[Car, ...]:
-        """All vehicles in the order of their rows: POV, VUT, and the cars ahead and behind."""
-        pair = Car(self.x_pov_m, self.v_pov_mps), Car(self.x_vut_m, self.v_vut_mps)
-        return self._traffic or pair
-
-    @property
     def others(self) -> tuple[Car, ...]:
         """All cars of the mainline, the one in front first."""
-        cars = list(self.vehicles)
+        if not self._traffic:
+            return (Car(self.x_pov_m, self.v_pov_mps),)
+        cars = list(self._traffic)
         del cars[VUT]
         return tuple(sorted(cars, reverse=True))
 
     @property
     def lane_begin_m(self) -> float:
-        """Where the acceleration lane begins; 0 where there is none."""
+        """Where the acceleration lane begins; 0 without one."""
         return self._lane_m[0]
 
     @property
     def lane_end_m(self) -> float:
-        """Where it ends; 0 where there is none."""
+        """Where the acceleration lane ends; 0 without one."""
         return self._lane_m[1]
 
     @property
@@ -100,7 +96,7 @@ class Seen(_State):
     def may_merge(self) -> bool:
         """Whether a merge request, now, puts the VUT on the mainline in the next step.
 
-        False after the merge, and where there is no acceleration lane.
+        False after the merge, and without an acceleration lane.
         """
         next_m = self.x_vut_m + self.v_vut_mps * DT_S
         is_on_lane = self.lane_begin_m < self.lane_end_m and not self._merged
@@ -169,8 +165,8 @@ class Start(msgspec.Struct, array_like=True, frozen=True):
             conflicting = int(conflicting_car(x_m[:, None], v_mps[:, None], scenario)[0])
         return cls(
             seed=case.controller_seed,
-            a_min_mps2=float(scenario.a_min_mps2),
-            a_max_mps2=float(scenario.a_max_mps2),
+            a_min_mps2=scenario.a_min_mps2,
+            a_max_mps2=scenario.a_max_mps2,
             lane_m=scenario.lane_m,
             conflicting=conflicting,
             x_m=tuple(x_m.tolist()),
@@ -275,12 +271,8 @@ class ControllerArray(ControllerDriver):
         self._replace = [False] * corridors
         self._signals: dict[int, StepSignals] = {}
         self._lanes_m: list[Bounds | None] = [None] * corridors
-        try:
-            for _ in range(corridors):
-                self._controllers.append(new())
-        except BaseException:
-            self.close()
-            raise
+        for _ in range(corridors):
+            self._controllers.append(new())
 
     def reset(self, corridor: int, start: Start) -> None:
         """Reset the controller of a corridor; an error is kept as the reason of its answer.
@@ -313,22 +305,22 @@ class ControllerArray(ControllerDriver):
         """
         self._signals = {}
         answers, merge_requests = [0.0] * self.corridors, [NO_REQUEST] * self.corridors
-        conflicting = [POV] * self.corridors
+        conflicting, merged = [POV] * self.corridors, [False] * self.corridors
         if scene.conflicting is not None:
             conflicting = scene.conflicting.tolist()
-        merged = [False] * self.corridors if scene.merged is None else scene.merged.tolist()
-        columns = scene.active, scene.step, scene.x_m.T, scene.v_mps.T
-        rows = zip(*(column.tolist() for column in columns), conflicting, merged, strict=True)
+        if scene.merged is not None:
+            merged = scene.merged.tolist()
+        # Items of lists are read faster than those of arrays.
+        steps, x_m, v_mps = scene.step.tolist(), scene.x_m.T.tolist(), scene.v_mps.T.tolist()
         with self._deadline as deadline:
-            for k, (active, step, x_m, v_mps, row, has_merged) in enumerate(rows):
-                if not active:
-                    continue
+            for k in np.flatnonzero(scene.active).tolist():
                 answers[k] = math.nan
                 if self._reasons[k] is not None:
                     continue
                 try:
-                    controller, lane_m, t_s = self._controllers[k], self._lanes_m[k], step * DT_S
-                    seen = seen_in(round(t_s, 1), row, x_m, v_mps, lane_m, merged=has_merged)
+                    controller, t_s = self._controllers[k], round(steps[k] * DT_S, 1)
+                    row, lane_m = conflicting[k], self._lanes_m[k]
+                    seen = seen_in(t_s, row, x_m[k], v_mps[k], lane_m, merged=merged[k])
                     deadline.start()
                     answer = as_answer(controller.act(seen))
                     signals = controller.signals()

@@ -1,4 +1,4 @@
-"""A VUT as an FMU: a co-simulation unit by FMI 2.0 or 3.0, such as Simulink exports."""
+"""A VUT as an FMU: a co-simulation unit of FMI 2.0 or 3.0, such as Simulink exports."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from merge_sumo.scenario.scenario import DT_S
 INPUTS = ("x_pov_m", "v_pov_mps", "x_vut_m", "v_vut_mps")
 OUTPUT = "acceleration_mps2"
 REACHED = "v_mps"
-"""An output that replaces the acceleration: the speed of the vehicle after the step."""
+"""An output instead of the acceleration: the speed of the vehicle after the step."""
 MERGE = "merge"
 SEED = "seed"
 """Optional variables: an output, whether to merge, and an input or a parameter."""
@@ -28,17 +28,16 @@ INTEGERS = ("Integer", "Int32", "UInt32", "Int64", "UInt64")
 class FmuKind(FileKind):
     """A unit: `fmu:FILE?x_vut_m=NAME&...`.
 
-    An input that the unit does not have is not set, if at least one is there and the spec names
-    none of the missing ones. An output must be there, the speed reached or else the acceleration;
-    a spec that names the acceleration alone selects it.
+    The unit may lack inputs that the spec does not name, but not all of them. Its output is the
+    speed reached, or else the acceleration; a spec that names the acceleration alone selects it.
 
     Attributes:
         version: first digit of the version of FMI.
-        inputs: index in the state and variable of each input.
+        inputs: for each input its index in `INPUTS`, and its variable.
         output: variable of the acceleration, or of the speed reached.
         reaches: whether the output is the speed reached.
-        merge_request: variable of the merge request, if there is one.
-        seed: variable of the seed, if there is one.
+        merge_request: variable of the merge request; None without one.
+        seed: variable of the seed; None without one.
     """
 
     form = "fmu:FILE[?VARIABLE=NAME&...]"
@@ -49,7 +48,15 @@ class FmuKind(FileKind):
     names = (*INPUTS, OUTPUT, REACHED, MERGE, SEED)
 
     def __init__(self, spec: ControllerSpec, options: ControllerOptions) -> None:
-        """Read the description of the unit; `UserError` for one that cannot drive."""
+        """Read the description of the unit.
+
+        Args:
+            spec: the file, and the names of its variables.
+            options: how it is hosted.
+
+        Raises:
+            UserError: if it cannot be read, or cannot drive.
+        """
         super().__init__(spec, options)
         path = self.path
         try:
@@ -103,7 +110,7 @@ class FmuKind(FileKind):
 
     @cached_property
     def _folder(self) -> TemporaryDirectory[str]:
-        """The unpacked unit, which is removed with this object."""
+        """The unpacked unit; it is removed with this object."""
         folder = TemporaryDirectory(prefix="merge-sumo-fmu-", ignore_cleanup_errors=True)
         self.api.extract(str(self.path), folder.name)
         return folder
@@ -140,7 +147,14 @@ class FmuController(Controller):
     """Steps an instance of the unit: set the state, step by 0.1 s, read."""
 
     def __init__(self, unit: FmuKind) -> None:
-        """Make an instance; `UserError` when that cannot be."""
+        """Make an instance.
+
+        Args:
+            unit: the unit.
+
+        Raises:
+            UserError: if it cannot be instantiated.
+        """
         self._unit, self._has_run = unit, False
         try:
             self._instance = unit.instance()
@@ -148,7 +162,11 @@ class FmuController(Controller):
             raise UserError(f"the FMU cannot be instantiated: {error}") from error
 
     def reset(self, start: Start) -> None:
-        """Initialise the instance at t = 0 with the state at the start."""
+        """Initialise the instance at t = 0 with the state at the start.
+
+        Args:
+            start: first observation of the episode.
+        """
         instance = self._instance
         if self._has_run:
             instance.reset()
@@ -167,7 +185,14 @@ class FmuController(Controller):
         instance.exitInitializationMode()
 
     def act(self, seen: Seen) -> float | tuple[float, bool]:
-        """Return the outputs after a step with the state held."""
+        """Return the outputs after a step of 0.1 s with a constant state.
+
+        Args:
+            seen: the observation at this step.
+
+        Returns:
+            An acceleration in m/s2, or (acceleration, whether to merge).
+        """
         unit = self._unit
         self._set_state(seen)
         self._instance.doStep(seen.t_s, DT_S)

@@ -117,9 +117,8 @@ def _importable(target: Any) -> str | None:
     if module in (None, "__main__", "__mp_main__") or "<" in name:
         return None
     imported: Any = sys.modules.get(str(module))
-    for own in ("__spec__", "__file__"):
-        if getattr(imported, own, None) is None:
-            return None
+    if getattr(imported, "__file__", None) is None:
+        return None
     for part in name.split("."):
         imported = getattr(imported, part, None)
     return f"{module}:{name}" if imported is target else None

@@ -1,7 +1,4 @@
-"""A VUT as an ONNX network: the state goes in, an acceleration or values of actions come out.
-
-One more output is the merge request, on a road with an acceleration lane.
-"""
+"""A VUT as an ONNX network from the state to an acceleration, or to values of actions."""
 
 from __future__ import annotations
 
@@ -20,20 +17,20 @@ from merge_sumo.scenario.scenario import DT_S
 STATE = ("x_pov_m", "v_pov_mps", "x_vut_m", "v_vut_mps")
 """The columns of a network's input, (1, 4)."""
 SEED = "seed"
-"""An optional input: the seed of the case, one number."""
+"""Name of an optional input: the seed of the case, one number."""
 PERIOD = "decision_period_s"
-"""Metadata of a network, or parameter of a spec: the network decides at this period."""
+"""Metadata of a network, or parameter of a spec: time between two decisions of the network."""
 DTYPES: dict[str, Any] = {
     "tensor(float)": np.float32,
     "tensor(double)": np.float64,
     "tensor(int64)": np.int64,
 }
-Decision = float | tuple[float, bool]
-"""An acceleration, or an acceleration and whether to merge."""
 
 
 class OnnxKind(FileKind):
     """A network: `onnx:FILE?decision_period_s=...`.
+
+    Its last output may be the merge request, on a road with an acceleration lane.
 
     Attributes:
         period_steps: steps from one decision to the next.
@@ -47,7 +44,15 @@ class OnnxKind(FileKind):
     names = (PERIOD,)
 
     def __init__(self, spec: ControllerSpec, options: ControllerOptions) -> None:
-        """Load the network; `UserError` for one that cannot drive."""
+        """Load the network.
+
+        Args:
+            spec: the file and its parameters.
+            options: how it is hosted.
+
+        Raises:
+            UserError: if it cannot be loaded, or cannot drive.
+        """
         super().__init__(spec, options)
         # One thread: answers must not depend on the cores of the machine.
         settings = self.api.SessionOptions()
@@ -80,7 +85,12 @@ class OnnxKind(FileKind):
         return OnnxController(self)
 
     def run(self, state: tuple[float, ...], seed: int = 0) -> NDArray[Any]:
-        """Return the flat output for one state, and a seed for a network that takes one."""
+        """Return the output for one state, flat.
+
+        Args:
+            state: values of `STATE`, in m and m/s.
+            seed: seed of the case, for a network that has an input for it.
+        """
         values = {self._input.name: np.array([state], DTYPES[self._input.type])}
         if self._seed is not None:
             # An axis without a number is that of a batch.
@@ -89,7 +99,7 @@ class OnnxKind(FileKind):
         return np.asarray(self._session.run(None, values)[0]).ravel()
 
     def _check_output(self) -> None:
-        """Raise `UserError` where the network does not run, or its output is not a VUT's."""
+        """Raise `UserError` if the network does not run, or its output cannot drive."""
         try:
             output = self.run((0.0, 0.0, 0.0, 0.0))
         except Exception as error:  # also of inputs of other types
@@ -117,22 +127,37 @@ class OnnxController(Controller):
     """Asks the network when a decision is due, and holds the decision in between."""
 
     def __init__(self, network: OnnxKind) -> None:
-        """Take the network, which all corridors share."""
+        """Take the network, which all corridors share.
+
+        Args:
+            network: the network.
+        """
         self._network = network
-        self._held: Decision = 0.0
+        self._held: Any = 0.0
 
     def reset(self, start: Start) -> None:
-        """Take the accelerations of the actions, and the seed."""
+        """Take the accelerations of the actions, and the seed.
+
+        Args:
+            start: first observation of the episode.
+        """
         self._actions_mps2, self._seed = actions_mps2(start), start.seed
 
-    def act(self, seen: Seen) -> Decision:
-        """Return the held decision; the network decides again where that is due."""
+    def act(self, seen: Seen) -> Any:
+        """Return the last decision; the network decides again when that is due.
+
+        Args:
+            seen: the observation at this step.
+
+        Returns:
+            An acceleration in m/s2, or (acceleration, whether to merge).
+        """
         if round(seen.t_s / DT_S) % self._network.period_steps == 0:
             self._held = self._decision(seen[1:])
         return self._held
 
-    def _decision(self, state: tuple[float, ...]) -> Decision:
-        """Return the acceleration, or that of the best action, and any merge request."""
+    def _decision(self, state: tuple[float, ...]) -> Any:
+        """Return the acceleration, or that of the best action; with any merge request."""
         output = self._network.run(state, self._seed)
         values = output if output.size in (1, ACTIONS) else output[:-1]
         acceleration_mps2 = math.nan

@@ -30,7 +30,14 @@ class Range:
 
     @classmethod
     def parsed(cls, text: str) -> Range:
-        """Read a range, NAME=LOW..HIGH; raises `UserError` for other text."""
+        """Return the range of a text.
+
+        Args:
+            text: NAME=LOW..HIGH.
+
+        Raises:
+            UserError: for another text, or an empty range.
+        """
         name, _, bounds = text.partition("=")
         try:
             low, high = map(float, bounds.split("..", 1))
@@ -51,7 +58,12 @@ class Range:
 def values_of(controller: ControllerKind, ranges: Sequence[Range]) -> dict[str, float]:
     """Return the present values of the parameters of some ranges, by name.
 
-    Raises `UserError` where one is unknown, named twice, or out of its range.
+    Args:
+        controller: the controller.
+        ranges: a range for each parameter.
+
+    Raises:
+        UserError: for a parameter that is unknown, given twice, or out of its range.
     """
     known = controller.parameters() if ranges else {}
     values: dict[str, float] = {}

@@ -1,6 +1,6 @@
-"""A second SUMO with the original net, in which a TraCI client sees and commands cars.
+"""A second SUMO with the original net, in which a TraCI client sees and commands vehicles.
 
-It decides on the motion that follows from commands to the VUT; after each of its steps the vehicles
+It decides the motion that follows from commands to the VUT; after each of its steps the vehicles
 are put where those of the campaign are.
 """
 
@@ -25,14 +25,14 @@ ROAD = "road.json"
 OPTIONS = (*SUMO_OPTIONS, "--collision.action", "warn")
 """SUMO reports collisions, which change nothing."""
 DEPARTURE_SPEED_MODE = 38
-"""Of the VUT: its limits of acceleration act, SUMO's checks of safety do not."""
+"""Speed mode in which the VUT departs: its limits of acceleration act, SUMO's safety checks not."""
 COLOURS = (*rgb("pov"), 255), (*rgb("vut"), 255)
-"""Of the cars of the mainline, and of the VUT."""
+"""Colours of the cars of the mainline, and of the VUT."""
 FASTEST_MPS = 45.0
-"""Speed that a car can drive wherever the road allows less; the limit of the shipped road."""
+"""Least maximum speed of a vehicle, where the road allows less; the limit of the shipped road."""
 VUT_ID = VEHICLES[VUT]
 ID_COUNT = 0x01
-"""Variable that every domain has."""
+"""A variable of every domain."""
 SPEED_MARGIN_MPS = 2.0
 """More than a vehicle gains in a step, unless a controller commands it without any limit."""
 
@@ -66,14 +66,19 @@ class MirrorSimulation:
     Attributes:
         road: both paths.
         at_m: positions of the vehicles on the road along their lanes, M = 0.
-        departed: vehicles that departed since they were last read; and `arrived`.
+        departed: vehicles that departed since the client last read them.
+        arrived: vehicles that arrived since the client last read them.
         merged: whether the VUT has left the acceleration lane of a road with one.
         requests_merge: whether SUMO has put the VUT on the mainline in its last step.
-        by_sumo: whether SUMO's own driver chose the speed of the VUT in it.
+        by_sumo: whether SUMO's own driver chose the speed of the VUT in its last step.
     """
 
     def __init__(self, folder: Path) -> None:
-        """Take the folder of `write_files`; `load` starts SUMO."""
+        """Read the road; `load` starts SUMO.
+
+        Args:
+            folder: the folder of `write_files`.
+        """
         self._libsumo = load_libsumo()
         self.road = msgspec.json.decode(
             (folder / ROAD).read_bytes(), type=Road, dec_hook=lambda kind, text: kind(text)
@@ -100,16 +105,28 @@ class MirrorSimulation:
         return float(self._libsumo.simulation.getTime())
 
     def path(self, name: str) -> LanePath:
-        """Return the lanes that a vehicle drives on."""
+        """Return the lanes on which a vehicle drives.
+
+        Args:
+            name: the vehicle.
+        """
         on_ramp = name == VUT_ID and not self.merged
         return self.road.ramp if on_ramp else self.road.mainline
 
     def point(self, name: str) -> LanePoint:
-        """Return the place of a vehicle; SUMO's own answer is that before it was put there."""
+        """Return the place of a vehicle; SUMO's own answer is that before it was put there.
+
+        Args:
+            name: the vehicle.
+        """
         return self.path(name).point(self.at_m[name])
 
     def load(self) -> None:
-        """Start with an empty road at time 0; `UserError` where SUMO cannot use the net."""
+        """Start with an empty road at time 0.
+
+        Raises:
+            UserError: if SUMO cannot use the net.
+        """
         libsumo, self.merged, self.at_m = self._libsumo, False, {}
         try:
             if self._started:
@@ -124,7 +141,11 @@ class MirrorSimulation:
             raise UserError(str(error)) from error
 
     def call(self, function: str, *arguments: Any) -> Any:
-        """Call a function of libsumo by its name, as `vehicle.getSpeed`.
+        """Return what a function of libsumo returns.
+
+        Args:
+            function: its name, as `vehicle.getSpeed`.
+            *arguments: its arguments.
 
         Raises:
             RefusedError: if SUMO refuses, or has no such function of these arguments.
@@ -142,11 +163,11 @@ class MirrorSimulation:
             raise RefusedError(f"{function} takes no ({given})") from error
 
     def around(self, point: Sequence[float], domain: int, range_m: float) -> list[str]:
-        """Return the objects around a point, found by a context subscription of a new object.
+        """Return the ids of the objects around a point, by a context subscription of a new object.
 
         Args:
             point: x and y in m.
-            domain: number of the domain of the objects.
+            domain: identifier of the questions of their domain.
             range_m: largest distance.
 
         Raises:
@@ -164,7 +185,11 @@ class MirrorSimulation:
         return sorted(found - {name})
 
     def enter(self, states: Mapping[str, State]) -> None:
-        """Make a step in which the vehicles depart, and put them into their states."""
+        """Make a step in which the vehicles depart, and put them into their states.
+
+        Args:
+            states: by the names of the vehicles.
+        """
         vehicle, self.merged = self._libsumo.vehicle, False
         for name, state in states.items():
             vehicle.add(name, f"route.{name}", typeID=name, **self._departure(name, state))
@@ -181,9 +206,10 @@ class MirrorSimulation:
         self.put(states)
 
     def step(self) -> float | None:
-        """Make a step; return the speed that SUMO gives the VUT, None where it is not there.
+        """Make a step, in which vehicles that come to the end of the net arrive.
 
-        A vehicle that comes to the end of the net arrives.
+        Returns:
+            The speed that SUMO gives the VUT, in m/s; None where it is not on the road.
         """
         vehicle, moved = self._libsumo.vehicle, self._change_lanes()
         self._libsumo.simulation.step()
@@ -237,7 +263,7 @@ class MirrorSimulation:
     def _change_lanes(self) -> list[str]:
         """Move vehicles at the end of a lane that ends to the lane next to it, and return them.
 
-        SUMO would stop them there.
+        SUMO would stop them at the end.
         """
         moved: list[str] = []
         if not self.road.lane_drop:
@@ -268,7 +294,11 @@ class MirrorSimulation:
 
 
 def edges_of(path: LanePath) -> list[str]:
-    """Return the edges of a path, without those inside junctions."""
+    """Return the edges of a path, without those inside junctions.
+
+    Args:
+        path: the path.
+    """
     edges: list[str] = []
     for piece in path.pieces:
         edge = piece.lane.rpartition("_")[0]

@@ -1,4 +1,4 @@
-"""SUMO's own TraCI client: it packs values, and says which functions numbers stand for."""
+"""SUMO's own TraCI client: it packs values, and knows the functions of command numbers."""
 
 from __future__ import annotations
 
@@ -17,7 +17,11 @@ from merge_sumo.sumo.binding import SUMO_VERSION, sumo_program
 
 
 def load_traci() -> Any:
-    """Return SUMO's own client, which comes with its programs; `UserError` where it is missing."""
+    """Return SUMO's own client, which comes with its programs.
+
+    Raises:
+        UserError: if it is missing.
+    """
     tools = str(Path(sumo_program("sumo")).parents[1] / "tools")
     if tools not in sys.path:
         sys.path.append(tools)
@@ -31,22 +35,21 @@ def load_traci() -> Any:
 
 @cache
 def packer() -> Callable[..., bytes]:
-    """Return the function that packs typed values: letters of a form, and the values."""
+    """Return the function that packs typed values, called with letters of a form and the values."""
     connection = load_traci().connection.Connection
     pack: Callable[..., bytes] = connection.__new__(connection)._pack
     return pack
 
 
 EXAMPLES: tuple[Any, ...] = ("x", 1.0, 1, [("1", 1.0, 1, 1)], (1, 2, 3, 4), [1.0], ["a"])
-"""Values of the arguments with which one function or another of the client sends its command."""
+"""Values of arguments: with one of them each function of the client sends its command."""
 
 
 @cache
 def functions() -> dict[tuple[int, int], tuple[str, ...]]:
     """Return functions, as `vehicle.getSpeed`, by the numbers of their command and variable.
 
-    Every function of the client's domains is called with a connection that only notes the
-    command.
+    Every function of the client is called with a connection that only notes the command.
     """
     traci = load_traci()
     found: dict[tuple[int, int], tuple[str, ...]] = {}
@@ -93,7 +96,12 @@ def _sent(domain: Any, call: Any) -> tuple[int, int] | None:
 
 
 def name_of(command: int, variable: int | None = None) -> str:
-    """Return the name of a command, on a variable if it is on one."""
+    """Return the name of a command.
+
+    Args:
+        command: its number.
+        variable: number of its variable; None for a command without one.
+    """
     if variable is None:
         for name, value in vars(load_traci().constants).items():
             if name.startswith("CMD_") and value == command:

@@ -9,7 +9,6 @@ import signal
 import subprocess
 import sys
 import time
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,15 +18,11 @@ from support.misbehaviours import STUBBORN
 from support.processes import none_left, wait_for
 from support.scenes import scene_of
 
-from merge_sumo.controllers.child_main import HostRequest, decode_request, encode
-from merge_sumo.controllers.controller import Start
 from merge_sumo.controllers.kinds import load
 from merge_sumo.controllers.process import append
 from merge_sumo.controllers.spec import ControllerOptions
 from merge_sumo.drivers.base import ControllerDiedError, Scene
 from merge_sumo.errors import UserError
-from merge_sumo.scenario.case import Case
-from merge_sumo.scenario.scenario import US23
 
 OPTIONS = ControllerOptions(deadline_s=0.3)
 HANGS = f"""
@@ -169,15 +164,3 @@ def test_nothing_else_in_the_place_of_the_log_is_written_or_waited_for(tmp_path)
     assert (tmp_path / "others").read_bytes() == b""
     os.mkfifo(tmp_path / "pipe")
     append(tmp_path / "pipe", b"x")
-
-
-def test_the_lane_and_merges_reach_the_process_and_the_rest_of_the_case_does_not():
-    lane = replace(US23, lane_m=(-70.0, 130.0), lane_end="stop", follow_up_s=5.0)
-    start = Start.of(Case(level=0, x_pov0_m=-250.0, v_pov0_mps=30.0, scenario=lane))
-    sent = scene(2)._replace(merged=np.array([False, True]))
-    request = decode_request(encode(HostRequest("act", starts=[(1, start)], scene=sent)))
-    assert request.starts == [(1, start)]
-    assert start.seen.lane_end_m == 130.0
-    assert {"level", "svo_rad"}.isdisjoint(start.__struct_fields__)
-    for array, other in zip(request.scene, sent, strict=True):
-        assert array is other is None or np.array_equal(array, other)

@@ -8,9 +8,9 @@ import re
 
 import numpy as np
 import pytest
-from support.vut_contract import ON_LANE, begin, factory, on_lane
+from support.vut_contract import begin, factory, on_lane
 
-from merge_sumo.controllers.controller import Start, seen_in
+from merge_sumo.controllers.controller import seen_in
 from merge_sumo.drivers.base import MERGE, NO_REQUEST, STAY, ControllerDiedError
 
 
@@ -31,11 +31,6 @@ def test_on_a_lane_the_observation_says_whether_a_request_is_granted(x_m, merged
     assert (seen.lane_begin_m, seen.lane_end_m) == (-70.0, 130.0)
     assert seen[1:] == (x_m - 30.0, 30.0, x_m, 20.0)
     assert [car.x_m for car in seen.others] == [x_m - 30.0]
-
-
-def test_the_start_has_the_lane():
-    start = Start.of(ON_LANE).seen
-    assert (start.lane_begin_m, start.may_merge, start.merged) == (-70.0, False, False)
 
 
 @pytest.mark.parametrize("x_m", [-1e-9, 0.0])

@@ -67,35 +67,26 @@ def test_a_network_with_an_input_seed_is_told_that_of_each_case(tmp_path, kind, 
     assert len({case.controller_seed for case in cases}) == 4
 
 
-REFUSED: dict[str, tuple[dict, str]] = {
-    "wide": ({"width": 5}, "does not run with the inputs of a VUT"),
-    "three": ({"answer": [0.0, 1.0, 0.0]}, "gives 3 numbers"),
-    "word": ({"seed": (onnx.TensorProto.INT32, [1])}, "an int64 (KeyError: 'tensor(int32)')"),
-    "index": ({"answer": [0, 0, 3, 0, 1], "last": "ArgMax"}, "gives int64, and a VUT gives floats"),
-}
-
-
-@pytest.mark.parametrize("name", REFUSED)
-def test_a_network_that_cannot_drive_is_refused_in_a_sentence(tmp_path, name):
-    options, said = REFUSED[name]
-    path = network(tmp_path / f"{name}.onnx", **{"answer": [0.0], **options})
-    with pytest.raises(UserError) as refused:
-        in_process(f"onnx:{path}")
-    assert said in str(refused.value)
-
-
 @pytest.mark.parametrize(
-    ("spec", "said"),
+    ("options", "parameter", "said"),
     [
-        ("nothing.onnx", "there is no such file"),
-        ("text.onnx", "is not a usable ONNX network"),
-        ("good.onnx?decision_period_s=often", "decision_period_s is 'often'"),
-        ("good.onnx?period=1", "it has no parameter 'period': choose from decision_period_s"),
+        ({}, "?decision_period_s=often", "decision_period_s is 'often'"),
+        ({}, "?period=1", "it has no parameter 'period': choose from decision_period_s"),
+        ({"width": 5}, "", "does not run with the inputs of a VUT"),
+        ({"answer": [0.0, 1.0, 0.0]}, "", "gives 3 numbers"),
+        ({"seed": (onnx.TensorProto.INT32, [1])}, "", "an int64 (KeyError: 'tensor(int32)')"),
+        ({"answer": [0, 3, 1], "last": "ArgMax"}, "", "gives int64, and a VUT gives floats"),
     ],
 )
-def test_a_file_or_a_parameter_of_another_kind_is_refused(tmp_path, spec, said):
-    (tmp_path / "text.onnx").write_text("text")
-    network(tmp_path / "good.onnx", answer=[0.0])
+def test_a_network_that_cannot_drive_is_refused_in_a_sentence(tmp_path, options, parameter, said):
+    path = network(tmp_path / "network.onnx", **{"answer": [0.0], **options})
     with pytest.raises(UserError) as refused:
-        in_process(f"onnx:{tmp_path / spec}")
+        in_process(f"onnx:{path}{parameter}")
     assert said in str(refused.value)
+
+
+def test_a_file_that_is_no_network_is_refused(tmp_path):
+    (tmp_path / "text.onnx").write_text("text")
+    for name, said in ("nothing", "there is no such file"), ("text", "not a usable ONNX network"):
+        with pytest.raises(UserError, match=said):
+            in_process(f"onnx:{tmp_path / name}.onnx")

@@ -16,15 +16,12 @@ import numpy as np
 import pytest
 import traci
 from support.controllers import (
-    RAW_CLIENT,
     STOCK_CLIENT,
     assert_drives_as_level0,
     free_port,
     program,
-    raw_client,
 )
 from support.processes import none_left
-from support.raw_traci import Client, GoneError
 from support.vut_contract import cases_of, factory, run_cases
 
 from merge_sumo.controllers.spec import ControllerOptions, ControllerSpec
@@ -171,20 +168,30 @@ def test_a_program_may_connect_for_every_episode_and_is_started_again_when_it_ha
     assert len((tmp_path / "started").read_text()) == 2
 
 
+SENDS = "s = traci.getConnection()._socket\ns.sendall({!r})\ns.recv(1)"
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("misdeed", "reason"),
     [
-        ("crashes", "ended with exit code 1: ZeroDivisionError: division by zero"),
-        ("says goodbye", "the controller closed the connection during the episode"),
-        ("a huge message", "not TraCI: a message of 2147483647 bytes was announced"),
-        ("nan", "the controller commanded vehicle.setSpeed(nan)"),
-        ("half a message", "sent half a message and no more within the deadline of 0.5 s"),
+        ("1 / 0", "ended with exit code 1: ZeroDivisionError: division by zero"),
+        ("traci.close()", "the controller closed the connection during the episode"),
+        (
+            SENDS.format(b"\x7f\xff\xff\xff"),
+            "not TraCI: a message of 2147483647 bytes was announced",
+        ),
+        ("traci.vehicle.setSpeed('vut', float('nan'))", "commanded vehicle.setSpeed(nan)"),
+        (SENDS.format(b"\0\0\0\x20\x05"), "sent half a message and no more within the deadline"),
     ],
+    ids=["crashes", "says goodbye", "a huge message", "nan", "half a message"],
 )
-def test_a_program_that_does_wrong_is_started_again_and_leaves_nothing(misdeed, reason):
-    vut = factory("traci:" + raw_client(misdeed), deadline_s=0.5)
+def test_a_program_that_does_wrong_is_started_again_and_leaves_nothing(tmp_path, misdeed, reason):
+    command = program(
+        tmp_path, f"{STOCK_CLIENT}for _ in range(4):\n    traci.simulationStep()\n{misdeed}"
+    )
     with none_left():
+        vut = factory("traci:" + command, deadline_s=0.5)
         trajectories = run_cases(vut, cases_of(2))
     for trajectory in trajectories:
         assert trajectory.end is End.VUT_ERROR
@@ -242,8 +249,8 @@ def test_commands_in_vain_are_named_in_the_end(tmp_path, command_line):
 
 
 def test_output_of_every_start_of_a_program_is_shown_once(tmp_path, capfd):
-    crash = "client.drive(2)\nraise ValueError('my bug')\n"
-    run_cases(factory("traci:" + program(tmp_path, RAW_CLIENT + crash)), cases_of(2))
+    crash = "traci.simulationStep()\nraise ValueError('my bug')\n"
+    run_cases(factory("traci:" + program(tmp_path, STOCK_CLIENT + crash)), cases_of(2))
     assert capfd.readouterr().err.count("ValueError: my bug") == 1
 
 
@@ -261,11 +268,11 @@ def test_a_port_that_is_invalid_or_taken_is_refused(capfd):
 
 def test_a_client_that_asks_and_makes_no_step_has_until_the_deadline():
     def client(port):
-        curious = Client(port)
-        curious.step()
-        with suppress(GoneError):
+        curious = traci.connect(port, numRetries=200, waitBetweenRetries=0.02)
+        curious.simulationStep()
+        with suppress(traci.FatalTraCIError):
             while True:
-                curious.speed()
+                curious.vehicle.getSpeed("vut")
 
     (reason,) = Played(client, steps=3, deadline_s=0.3).reasons
     assert reason.endswith("within the deadline of 0.3 s")
@@ -289,7 +296,7 @@ class TestUsersOfAConnection:
                 client.close()
                 assert vut.users_of(connection) == set(), "it is gone"
 
-    def test_that_are_others_are_not_served(self, monkeypatch):
+    def test_that_are_others_are_not_served(self, monkeypatch, tmp_path):
         monkeypatch.setattr(vut, "users_of", lambda _: {os.geteuid(), os.geteuid() + 1})
         with pytest.raises(UserError, match="before it connected"):
-            run_cases(factory("traci:" + raw_client(), connect_s=1.0), cases_of(1))
+            run_cases(factory("traci:" + program(tmp_path, STOCK_CLIENT)), cases_of(1))

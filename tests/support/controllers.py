@@ -12,13 +12,6 @@ from support.vut_contract import factory, run_cases
 from merge_sumo.controllers.spec import ControllerKind
 from merge_sumo.scenario.case import Case
 
-SUPPORT = Path(__file__).parent
-RAW_CLIENT = f"""import os, sys, time
-sys.path.insert(0, {str(SUPPORT.parent)!r})
-from support.raw_traci import Client
-client = Client(int(sys.argv[1]))
-"""
-"""Begins a program that drives by our own client."""
 STOCK_CLIENT = "import sys, time, traci\ntraci.init(int(sys.argv[1]), numRetries=600)\n"
 """Begins a program that drives by SUMO's own client."""
 
@@ -32,11 +25,6 @@ def program(folder: Path, source: str, name: str = "controller.py") -> str:
     """Write a Python program into a folder; return the command that starts it with the port."""
     (folder / name).write_text(source, encoding="utf-8")
     return f"{sys.executable} {folder / name} {{port}}"
-
-
-def raw_client(misdeed: str = "") -> str:
-    """Return the command of our own client, which drives as level 0, or does something wrong."""
-    return f"{sys.executable} {SUPPORT / 'raw_traci.py'} {{port}} {misdeed and repr(misdeed)}"
 
 
 def assert_drives_as_level0(vut: ControllerKind, cases: list[Case], within: float = 1e-9) -> None:

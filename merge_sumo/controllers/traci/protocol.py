@@ -1,7 +1,7 @@
-"""The bytes of TraCI, the protocol by which a program controls SUMO; no sockets here.
+"""The bytes of TraCI, the protocol by which a program controls SUMO.
 
-A message is a length and commands; a command is a length, an identifier and a payload; numbers are
-big-endian (https://sumo.dlr.de/docs/TraCI/Protocol.html).
+https://sumo.dlr.de/docs/TraCI/Protocol.html: a message is a length and commands; a command is a
+length, an identifier and a payload; numbers are big-endian.
 """
 
 from __future__ import annotations
@@ -12,12 +12,12 @@ from functools import partial
 from operator import attrgetter, itemgetter
 from typing import Any, NamedTuple
 
-from merge_sumo.sumo.binding import SUMO_VERSION
 from merge_sumo.sumo.traci_names import packer
 
 MAX_MESSAGE_BYTES = 1 << 20
-"""Limit of a message; garbage that is read as a length mostly exceeds it."""
+"""Limit of a message; random bytes that are read as a length mostly exceed it."""
 MAX_NESTING = 4
+"""Limit of compounds in compounds."""
 API_VERSION = 22
 """Version of the TraCI of SUMO 1.28."""
 VERSION, STEP, SET_ORDER, CLOSE = 0x00, 0x02, 0x03, 0x7F
@@ -25,13 +25,15 @@ GET_VEHICLE, GET_JUNCTION, SET_VEHICLE = 0xA4, 0xA9, 0xC4
 OK, ERROR = 0x00, 0xFF
 VALUES = {0x07: "B", 0x08: "b", 0x09: "i", 0x0B: "d", 0x0C: "s"}
 LISTS = {0x0E: "s", 0x10: "d"}
-"""Forms of `Reader.value` by the types of values, and of the items of lists."""
+"""Forms of `Reader.value` by types of values, and by types of lists for their items."""
 COMPOUND, COLOR = 0x0F, 0x11
 LON_LAT, ROAD = 0x00, 0x04
 POSITIONS = "dd", "dd", "ddd", "ddd", "sdB"
 PLACES = "goGOr"
-"""Forms, and letters of `pack`, by the types of positions: on earth, in the plane, both with
-height, and on a road."""
+"""Forms of `Reader.value`, and letters of `pack`, by the types of positions.
+
+They are: on earth, in the plane, both with height, and on a road.
+"""
 
 
 class ProtocolError(Exception):
@@ -39,21 +41,31 @@ class ProtocolError(Exception):
 
 
 class Command(NamedTuple):
-    """A command of a message."""
+    """A command of a message.
+
+    Attributes:
+        identifier: its number.
+        payload: the bytes after it.
+    """
 
     identifier: int
     payload: bytes
 
 
 class Position(NamedTuple):
-    """A position: its type, and its coordinates, or road, position on it and number of lane."""
+    """A position.
+
+    Attributes:
+        kind: its type, an index of `POSITIONS`.
+        place: coordinates, or road, position along it in m and number of the lane.
+    """
 
     kind: int
     place: list[Any]
 
 
 class Reader:
-    """Reads values from bytes, one after the other; raises `ProtocolError`."""
+    """Reads values from bytes, one after the other; its methods raise `ProtocolError`."""
 
     def __init__(self, data: bytes) -> None:
         self._data, self._at = data, 0
@@ -64,14 +76,22 @@ class Reader:
         return len(self._data) - self._at
 
     def raw(self, count: int) -> bytes:
-        """Return the next `count` bytes."""
+        """Return the next bytes.
+
+        Args:
+            count: their number.
+        """
         if not 0 <= count <= self.left:
             raise ProtocolError(f"{count} bytes were announced where {self.left} are left")
         start, self._at = self._at, self._at + count
         return self._data[start : self._at]
 
     def value(self, form: str) -> Any:
-        """Return the next value: a number in a form of `struct`, or a string for "s"."""
+        """Return the next value.
+
+        Args:
+            form: a form of `struct` for a number, or "s" for a string.
+        """
         if form == "s":
             return self.string()
         (number,) = struct.unpack(f"!{form}", self.raw(struct.calcsize(f"!{form}")))
@@ -85,13 +105,17 @@ class Reader:
             raise ProtocolError("a string is not UTF-8") from error
 
     def count(self) -> int:
-        """Return the number of values of a compound, whose type is next."""
+        """Return the number of values of the compound that is next."""
         if self.value("B") != COMPOUND:
             raise ProtocolError("a compound was expected")
         return self._length()
 
     def typed(self, nesting: int = 0) -> Any:
-        """Return the next value, with a type before it; a compound is a list of its values."""
+        """Return the next value, with a type before it; a compound is a list of its values.
+
+        Args:
+            nesting: number of compounds that it is in.
+        """
         kind = self.value("B")
         if kind in VALUES:
             return self.value(VALUES[kind])
@@ -129,7 +153,7 @@ class Reader:
 
 
 def _flat(value: Any) -> list[Any]:
-    """Return the values of a compound and of those in it."""
+    """Return the values of a compound and of the compounds in it."""
     if not isinstance(value, list):
         return [value]
     values = []
@@ -139,7 +163,14 @@ def _flat(value: Any) -> list[Any]:
 
 
 def message_length(head: bytes) -> int:
-    """Return the number of bytes that follow the first four of a message."""
+    """Return the number of bytes that follow the length of a message.
+
+    Args:
+        head: its first four bytes.
+
+    Raises:
+        ProtocolError: if it is negative, or above the limit.
+    """
     length = int.from_bytes(head, "big", signed=True) - 4
     if not 0 <= length <= MAX_MESSAGE_BYTES:
         raise ProtocolError(f"a message of {length + 4} bytes was announced")
@@ -147,7 +178,14 @@ def message_length(head: bytes) -> int:
 
 
 def commands_of(body: bytes) -> list[Command]:
-    """Return the commands of a message without its first four bytes."""
+    """Return the commands of a message.
+
+    Args:
+        body: the message without its first four bytes.
+
+    Raises:
+        ProtocolError: if these are not commands.
+    """
     reader = Reader(body)
     commands: list[Command] = []
     while reader.left or not commands:
@@ -162,12 +200,20 @@ def commands_of(body: bytes) -> list[Command]:
 
 
 def message(content: bytes) -> bytes:
-    """Return a message: the content after its length."""
+    """Return a message.
+
+    Args:
+        content: its commands.
+    """
     return struct.pack("!i", len(content) + 4) + content
 
 
 def command(content: bytes) -> bytes:
-    """Return an identifier and its payload after their length."""
+    """Return a command.
+
+    Args:
+        content: its identifier and its payload.
+    """
     if len(content) < 255:
         return bytes((len(content) + 1,)) + content
     return b"\x00" + struct.pack("!i", len(content) + 5) + content
@@ -177,45 +223,53 @@ def status(identifier: int, result: int = OK, text: str = "") -> bytes:
     """Return the first answer to every command.
 
     Args:
-        identifier: that of the command.
+        identifier: number of the command.
         result: `OK` or `ERROR`.
-        text: message of an error; cut, because clients read the length as one byte.
+        text: message of an error.
     """
+    # Clients read the length as one byte.
     short = text.encode()[:200].decode(errors="ignore")
     return command(bytes((identifier, result)) + string(short))
 
 
 def string(value: str) -> bytes:
-    """Return a string without its type."""
+    """Return a string without its type.
+
+    Args:
+        value: the string.
+    """
     encoded = value.encode()
     return struct.pack("!i", len(encoded)) + encoded
 
 
 def compound(count: int, content: bytes) -> bytes:
-    """Return `count` typed values as one."""
+    """Return a compound.
+
+    Args:
+        count: number of its values.
+        content: the values with their types.
+    """
     return struct.pack("!Bi", COMPOUND, count) + content
 
 
 def pack(form: str, *values: Any) -> bytes:
-    """Return typed values, one for each letter of `form`, as SUMO's own client packs them.
+    """Return values with their types, as SUMO's own client packs them.
 
-    Integer, double, string, signed and unsigned Byte, list of strings, list of floats, position in
-    the plane (o) and in space (O), on earth (g, G) and on a road (r), colour, and polygon.
+    Args:
+        form: a letter for each value: integer (i), double (d), string (s), signed (b) and unsigned
+            byte (B), list of strings (l) or of floats (f), position in the plane (o), in space (O),
+            on earth (g, G) or on a road (r), colour (c), polygon (p).
+        *values: the values.
     """
     return packer()(form, *values)
-
-
-def version_answer() -> bytes:
-    """Return the answer to the question for the version, without its status."""
-    text = string(f"SUMO {SUMO_VERSION}, hosted by merge-sumo")
-    return command(struct.pack("!Bi", VERSION, API_VERSION) + text)
 
 
 def packed(function: str, answer: Any) -> bytes:
     """Return an answer of libsumo as a typed value, as SUMO's own server packs it.
 
     Args:
-        function: the function of libsumo, which decides where the type in Python does not.
+        function: the function of libsumo, which decides the form where the type of its answer does
+            not.
         answer: its return value.
 
     Raises:

@@ -1,7 +1,4 @@
-"""Questions and commands of a TraCI client: libsumo's functions of the same names answer.
-
-Time continues over the episodes: in each the vehicles depart, and when it ends they arrive.
-"""
+"""Questions and commands of a TraCI client, which libsumo's functions of the same names answer."""
 
 from __future__ import annotations
 
@@ -14,6 +11,7 @@ from functools import cache
 from typing import Any, NamedTuple
 
 from merge_sumo.controllers.traci.protocol import (
+    API_VERSION,
     ERROR,
     GET_JUNCTION,
     GET_VEHICLE,
@@ -32,31 +30,31 @@ from merge_sumo.controllers.traci.protocol import (
     packed,
     status,
     string,
-    version_answer,
 )
 from merge_sumo.scenario.scenario import DT_S, VEHICLES
+from merge_sumo.sumo.binding import SUMO_VERSION
 from merge_sumo.sumo.mirror import VUT_ID, MirrorSimulation, RefusedError, State
 from merge_sumo.sumo.traci_names import functions, name_of
 
 QUESTIONS = frozenset({*range(0x24, 0x2C), *range(0xA0, 0xB0)})
 """Identifiers of questions, one for each domain."""
 SET, SUBSCRIBE, CONTEXT, RESPONSE = 0x20, 0x30, -0x20, 0x10
-"""Offsets from the questions of a domain to its commands, subscriptions and context subscriptions,
+"""Offsets from the questions of a domain to its commands, subscriptions and context subscriptions;
 and from questions and subscriptions to their answers."""
 SERVED_BY = {
     "trafficlight.getNemaPhaseCalls": "trafficlight.getParameter",
     "vehicle.couldChangeLane": "vehicle.getLaneChangeState",
     "vehicle.getLeftFollowers": "vehicle.getNeighbors",
 }
-"""Of several functions that read one variable, by the first: the one that SUMO's server calls."""
+"""Where several functions read one variable: by the first, the one that SUMO's server calls."""
 WITH_PARAMETER = ("getLeader", "getFollower", "getParameter", "getParameterWithKey")
 """Functions whose variables have a parameter in a subscription."""
 OWN_TYPE = f"{VUT_ID}@{VUT_ID}"
-"""SUMO's name for the type of a vehicle that has numbers of its own."""
+"""SUMO's name of the type of a VUT that has numbers of its own."""
 OFF_THE_LANE_M = 2.0
-"""A vehicle that its own model moves is on a lane up to here: half of the width of a wide one."""
+"""A vehicle that its own model moves is on a lane up to this distance: half of a wide lane."""
 COMING = 2
-"""Vehicles that are expected between two episodes."""
+"""Number of expected vehicles between two episodes."""
 
 
 class Effect(Enum):
@@ -89,12 +87,16 @@ EFFECTS = {
 }
 """Commands on vehicles and their types by their effect; others are refused."""
 ONLY_SEEN = ("gui", "poi", "polygon")
-"""Domains of objects that are only looked at."""
+"""Domains of objects that are only drawn."""
 
 
 @cache
 def effect_of(names: tuple[str, ...]) -> Effect:
-    """Return the effect of the commands that share a number."""
+    """Return the effect of a command.
+
+    Args:
+        names: the functions that send it, as "vehicle.setSpeed".
+    """
     if "vehicle.setParameter" in names:
         return Effect.OWN_KEYS
     for name in names:
@@ -108,11 +110,13 @@ def effect_of(names: tuple[str, ...]) -> Effect:
 
 
 def is_answered(names: tuple[str, ...]) -> bool:
-    """Return whether SUMO is asked the question that has these names.
+    """Return whether SUMO is asked a question.
 
-    Not answered are questions of its window, without which SUMO may end, and those that a merge
-    does not need: trains, programs of traffic lights, routes to find, and distances between any
-    two positions.
+    It is not asked about its window, without which it may end, nor what a merge does not need:
+    trains, programs of traffic lights, routes to find, and distances between any two positions.
+
+    Args:
+        names: the functions that ask it; the first one decides.
     """
     name = names[0] if names else "gui."
     if name.startswith(("gui.", "simulation.find", "simulation.getDistance")):
@@ -125,13 +129,13 @@ class NotFiniteError(Exception):
 
 
 class Subject(NamedTuple):
-    """An object whose values, or the values of objects around it, are subscribed to.
+    """An object, or the objects around it, whose values a client has subscribed to.
 
     Attributes:
-        getter: identifier of the questions of its domain.
-        name: its id.
+        getter: identifier of the questions of the object's domain.
+        name: id of the object.
         domain: identifier of the questions that are answered.
-        range_m: largest distance of the objects around it; None for its own values.
+        range_m: largest distance of the objects around it; None for the object itself.
     """
 
     getter: int
@@ -141,9 +145,13 @@ class Subject(NamedTuple):
 
 
 class _Place(NamedTuple):
-    """Where a client moves the VUT to: along its lanes, in the plane, on the mainline or not.
+    """The place to which a client moves the VUT in a step.
 
-    By eq. (4) it has the speed `v_mps` from the end of the step on, and comes elsewhere.
+    Attributes:
+        v_mps: the speed of the VUT after the step; eq. (4) moves it by the speed before.
+        x_m: distance to M along the lane, negative before M.
+        point: the place in the plane, (x, y) in m.
+        on_mainline: whether its lane is one of the mainline.
     """
 
     v_mps: float
@@ -153,30 +161,38 @@ class _Place(NamedTuple):
 
 
 class Session:
-    """The simulation as one client sees it.
+    """The simulation as one client sees it; `Server` has its socket and makes its steps.
 
-    It has no socket and does not decide when a step is made. A client gets the values of its
-    subscriptions with the answer to every step. SUMO's own results are those before the vehicles
-    are put where those of the campaign are, so every value is read again.
+    Time continues over the episodes: the vehicles depart when an episode begins, and arrive when it
+    ends. The answer to a step has the values that the client has subscribed to. They are read again
+    after each step, because SUMO's own results are those before the vehicles are put where those of
+    the campaign are.
 
     Attributes:
-        in_vain: commands of this episode that change nothing here, and would in SUMO.
+        sumo: the second SUMO.
+        in_vain: commands of this episode that changed nothing and would in SUMO.
         expected: whether more vehicles may come.
-        subscriptions: variables, each with its parameter as it was sent.
+        subscriptions: by subject, its variables, each with its parameter as it was sent.
     """
 
     def __init__(self, sumo: MirrorSimulation) -> None:
+        """Begin without subscriptions.
+
+        Args:
+            sumo: the second SUMO.
+        """
         self.sumo = sumo
         self.subscriptions: dict[Subject, dict[int, bytes]] = {}
         self.in_vain: set[str] = set()
         self.expected = True
         self._reached_mps: float | None = None
-        """Speed at the end of the coming step, as commanded."""
+        """Speed at the end of the next step, as commanded."""
         self._moved: _Place | None = None
-        """Where the client moved the VUT to in the last step."""
+        """Place to which the client moved the VUT in the last step."""
         self._moves: _Place | None = None
-        """Where it moves it to in the coming one."""
-        self._commands_speeds = False  # in this episode
+        """Place to which it moves the VUT in the next step."""
+        self._commands_speeds = False
+        """Whether the client has commanded a speed in this episode."""
         self.answered()
 
     def answered(self) -> None:
@@ -185,7 +201,12 @@ class Session:
         self.sumo.arrived.clear()
 
     def enter(self, states: Mapping[str, State], seed: int = 0) -> None:
-        """Make a step in which the vehicles depart; `seed` is a parameter of the VUT."""
+        """Make a step in which the vehicles depart.
+
+        Args:
+            states: their states.
+            seed: seed of the episode, a parameter of the VUT.
+        """
         self._moved = self._moves = self._reached_mps = None
         self._commands_speeds = False
         self.in_vain.clear()
@@ -193,7 +214,12 @@ class Session:
         self.sumo.call("vehicle.setParameter", VUT_ID, "seed", str(seed))
 
     def step(self) -> float | None:
-        """Make a step; return the speed that the VUT has reached, or that SUMO gives it."""
+        """Make a step.
+
+        Returns:
+            The speed in m/s that the client says the VUT has reached, or else that SUMO gives it;
+            None where the VUT is not on the road.
+        """
         v_mps, moves, reached_mps = self.sumo.step(), self._moves, self._reached_mps
         if moves is not None and reached_mps is None:
             reached_mps = moves.v_mps
@@ -203,7 +229,12 @@ class Session:
         return v_mps
 
     def put(self, states: Mapping[str, State], *, merged: bool = False) -> None:
-        """Put the vehicles into their states after the step; `merged` is of the VUT."""
+        """Put the vehicles into their states after the step.
+
+        Args:
+            states: their states.
+            merged: whether the VUT has left the acceleration lane.
+        """
         self.sumo.put(states, merged=merged)
         is_moved = self._moves is not None or self._reached_mps is not None
         if is_moved and not self._commands_speeds and VUT_ID in self.sumo.at_m:
@@ -227,7 +258,15 @@ class Session:
         return struct.pack("!i", len(answers)) + b"".join(answers)
 
     def handle(self, request: Command) -> bytes:
-        """Return the answer to any command but a step or a close; raises `ProtocolError`."""
+        """Return the answer to any command but a step or a close.
+
+        Args:
+            request: the command.
+
+        Raises:
+            ProtocolError: if its bytes are not TraCI.
+            NotFiniteError: for a command with a number that is not finite.
+        """
         identifier, reader = request.identifier, Reader(request.payload)
         try:
             return status(identifier) + self._answer(identifier, reader)
@@ -243,19 +282,20 @@ class Session:
         if identifier - SET in QUESTIONS:
             self._command(identifier, reader)
             return b""
-        for offset in (SUBSCRIBE, CONTEXT):
-            domain = getter = identifier - offset
-            if getter in QUESTIONS:
-                reader.raw(16)  # its begin and its end: it holds until it is ended
-                name, range_m = reader.string(), None
-                if offset == CONTEXT:
-                    domain, range_m = reader.value("B"), reader.value("d")
-                return self._subscribe(Subject(getter, name, domain, range_m), reader)
         if identifier == VERSION:
-            return version_answer()
+            version = string(f"SUMO {SUMO_VERSION}, hosted by merge-sumo")
+            return command(struct.pack("!Bi", VERSION, API_VERSION) + version)
         if identifier == SET_ORDER:
             return b""
-        raise RefusedError(f"merge-sumo does not carry out {name_of(identifier)}")
+        is_context = identifier - CONTEXT in QUESTIONS
+        domain = getter = identifier - (CONTEXT if is_context else SUBSCRIBE)
+        if getter not in QUESTIONS:
+            raise RefusedError(f"merge-sumo does not carry out {name_of(identifier)}")
+        reader.raw(16)  # its begin and its end: it holds until it is ended
+        name, range_m = reader.string(), None
+        if is_context:
+            domain, range_m = reader.value("B"), reader.value("d")
+        return self._subscribe(Subject(getter, name, domain, range_m), reader)
 
     # Questions
 
@@ -328,7 +368,13 @@ class Session:
         return "vehicle.getDrivingDistance2D", [name, x, y]
 
     def position(self, name: str) -> tuple[float, ...]:
-        """Return where a vehicle is in the plane; as in SUMO, the VUT is where it was moved to."""
+        """Return the position of a vehicle in the plane, (x, y) in m.
+
+        As in SUMO, a VUT that the client has moved is at that place.
+
+        Args:
+            name: the vehicle.
+        """
         if name == VUT_ID and self._moved is not None:
             return self._moved.point
         return self.sumo.point(name)[2:4]
@@ -442,17 +488,17 @@ class Session:
 
         Raises:
             RefusedError: for a value that SUMO's models cannot have.
-            NotFiniteError: for another number that is not finite: the VUT would drive on as if
-                nothing was commanded.
+            NotFiniteError: for a number that is not finite: the VUT would drive on as if nothing
+                was commanded.
         """
         name = function.partition(".")[2]
         for number in numbers:
-            is_valid = 0.0 <= number < math.inf and (name, number) != ("setMaxSpeed", 0.0)
-            if name in MODEL.split() and not is_valid:
-                raise RefusedError(f"Invalid value {number:g} of {function}.")
             if not math.isfinite(number):
                 shown = ", ".join(map("{:g}".format, numbers))
                 raise NotFiniteError(f"{function}({shown})")
+            is_valid = number >= 0.0 and (name, number) != ("setMaxSpeed", 0.0)
+            if name in MODEL.split() and not is_valid:
+                raise RefusedError(f"Invalid value {number:g} of {function}.")
 
     def _reach(self, function: str, numbers: Sequence[float]) -> None:
         """Take the speed, or the place (x, y), that the VUT has at the end of the coming step."""

@@ -1,6 +1,6 @@
 """A VUT by TraCI: a controller written for SUMO, in any language, drives the vehicle `vut`.
 
-A child process (`child.py`) serves it by a second SUMO, in which its commands have SUMO's meaning.
+A child process (`server.py`) serves it by a second SUMO, in which its commands have SUMO's meaning.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from merge_sumo.controllers.process import (
     split_command,
 )
 from merge_sumo.controllers.spec import ControllerKind, ControllerOptions, ControllerSpec
-from merge_sumo.controllers.traci.child import Child, FaultError, Reply
+from merge_sumo.controllers.traci.server import FaultError, Reply, ServerProcess
 from merge_sumo.drivers.acceleration_lane import speed_to_stop_mps
 from merge_sumo.drivers.base import MERGE, STAY, ControllerDiedError, Driver, Scene
 from merge_sumo.errors import UserError
@@ -142,7 +142,7 @@ class TraciVut(Driver):
         self._kind, self._options = kind, kind.options
         self._log = kind.options.log
         self._road, self._scenario = road, scenario
-        self._child = Child(road, scenario)
+        self._server = ServerProcess(road, scenario)
         self._begins_m = np.full(scenario.vehicles, -road.mainline.before_m)
         self._begins_m[VUT] = -road.ramp.before_m
         self._listener: socket.socket | None = None
@@ -215,7 +215,7 @@ class TraciVut(Driver):
             with suppress(FaultError, ControllerDiedError):
                 ends = self._ask("farewell").closed
         self._disconnect(grace=ends)
-        self._child.kill()
+        self._server.kill()
 
     def _acceleration_mps2(self, scene: Scene) -> float:
         """Show the vehicles, and return the acceleration that the client commands."""
@@ -263,7 +263,7 @@ class TraciVut(Driver):
         """
         patience_s += self._options.deadline_s + WORK_S
         try:
-            reply = self._child.request(action, patience_s, **values)
+            reply = self._server.request(action, patience_s, **values)
         except ProcessDiedError as died:
             reason = f"the SUMO that answers the controller {died}"
             if died.hung:
@@ -287,8 +287,8 @@ class TraciVut(Driver):
         patience_s = self._patience_s
         # A client that did not come once is not waited for as long again.
         self._patience_s = min(patience_s, self._options.deadline_s)
-        if not self._child.alive:
-            self._child = Child(self._road, self._scenario)
+        if not self._server.alive:
+            self._server = ServerProcess(self._road, self._scenario)
         if self._listener is None:
             try:
                 self._listener = socket.create_server((HOST, self._kind.port))

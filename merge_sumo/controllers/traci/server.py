@@ -1,7 +1,6 @@
-"""The process that serves TraCI clients by a SUMO with the original net, and its handle.
+"""The child process that serves TraCI clients by a second SUMO, and its handle in the parent.
 
-The process that runs the cases passes on the connections of clients, and step by step the states of
-the vehicles. A reply is the speed that SUMO gives the VUT by the client's commands, or its fault.
+The parent passes on the connections of clients, and the states of the vehicles step by step.
 """
 
 from __future__ import annotations
@@ -46,17 +45,17 @@ ROUNDING_S = 1e-9
 
 
 class Reply(msgspec.Struct, omit_defaults=True):
-    """The reply of the serving process.
+    """The reply of the serving process to a request.
 
     Attributes:
-        v_mps: the speed that the VUT is to have after the step; None beyond the end of the net.
-        merge: whether it requests to leave the acceleration lane.
+        v_mps: the speed that SUMO gives the VUT for the step; None beyond the end of the net.
+        merge: whether the VUT requests to leave the acceleration lane.
         by_sumo: whether SUMO's own driver chose the speed.
-        fault: the client's fault; "" for none.
-        gone: whether its connection has ended, so that its program may say why.
-        closed: whether the client has said goodbye while the VUT was not on the road.
-        refused: why the process cannot carry out the request.
-        in_vain: commands of the episode that change nothing here.
+        fault: the client's fault; "" without one.
+        gone: whether the connection of the client has ended, so that its program may say why.
+        closed: whether the client has closed it while the VUT was not on the road.
+        refused: why the process cannot carry out the request; "" if it did.
+        in_vain: commands of the episode that changed nothing.
     """
 
     v_mps: float | None = None
@@ -70,18 +69,38 @@ class Reply(msgspec.Struct, omit_defaults=True):
 
 
 class FaultError(Exception):
-    """The client's fault; `gone` and `closed` are those of a `Reply`."""
+    """A fault of the client.
+
+    Attributes:
+        gone: as in `Reply`.
+        closed: as in `Reply`.
+    """
 
     def __init__(self, text: str, *, gone: bool = False, closed: bool = False) -> None:
+        """Keep the fault.
+
+        Args:
+            text: the fault in words.
+            gone: as in `Reply`.
+            closed: as in `Reply`.
+        """
         super().__init__(text)
         self.gone, self.closed = gone, closed
 
 
-class Child(ChildProcess):
+class ServerProcess(ChildProcess):
     """The serving process, with the road and the vehicles of a scenario."""
 
     def __init__(self, road: Road, scenario: Scenario) -> None:
-        """Start the process; `UserError` if it cannot be started."""
+        """Start the process.
+
+        Args:
+            road: the road of the vehicles.
+            scenario: their number, lengths and limits.
+
+        Raises:
+            UserError: if it cannot be started.
+        """
         if os.name != "posix":
             raise UserError("a controller by TraCI needs Linux or macOS")
         no_warnings = Path(os.devnull)
@@ -95,7 +114,7 @@ class Child(ChildProcess):
 
         Args:
             action: name of a method of `Server`.
-            patience_s: time that the process has.
+            patience_s: time for the reply.
             client: a connection to pass on.
             values: other arguments of the method.
 
@@ -117,7 +136,11 @@ class Child(ChildProcess):
 
 
 def main(settings: Mapping[str, Any]) -> None:
-    """Serve clients, one after the other, until the parent ends."""
+    """Serve clients, one after the other, until the parent ends.
+
+    Args:
+        settings: those of `ServerProcess`.
+    """
     limits = {"RLIMIT_DATA": MOST_MEMORY_BYTES, "RLIMIT_FSIZE": MOST_FILE_BYTES}
     connection, server = connected(settings, **limits), Server(Path(settings["folder"]))
     os.chdir(settings["folder"])
@@ -130,7 +153,10 @@ def main(settings: Mapping[str, Any]) -> None:
 
 
 class Server:
-    """Serves one client at a time; its public methods are the requests of the parent."""
+    """Serves one client at a time.
+
+    The parent requests its methods `serve`, `step` and `farewell` by their names.
+    """
 
     _session: Session
     _client: socket.socket
@@ -140,7 +166,12 @@ class Server:
         self._sumo: MirrorSimulation | None = None
 
     def reply(self, action: str, values: Mapping[str, Any]) -> Reply:
-        """Return the reply to a request: the name of a method, and its arguments."""
+        """Return the reply to a request.
+
+        Args:
+            action: name of a method.
+            values: its arguments by name.
+        """
         try:
             reply: Reply = getattr(self, action)(**values)
         except FaultError as fault:
@@ -151,11 +182,11 @@ class Server:
         return reply
 
     def serve(self, client: socket.socket, deadline_s: float) -> Reply:
-        """Serve a client in the place of the one before, on an empty road.
+        """Serve a client instead of the last one, on an empty road.
 
         Args:
             client: its connection.
-            deadline_s: time that it has for each of its steps.
+            deadline_s: its time for each step.
         """
         if self._sumo is None:
             self._sumo = MirrorSimulation(self._folder)
@@ -165,7 +196,7 @@ class Server:
         self._commands: deque[Command] = deque()
         self._answers = b""
         self._until_step_s: float | None = None
-        """Time up to which the client asked to step, if it waits for a step; 0 for one step."""
+        """Time in s to which the client steps, 0 for one step; None where it does not step yet."""
         return Reply()
 
     def step(self, states: Mapping[str, State], *, merged: bool, seed: int | None = None) -> Reply:
@@ -258,8 +289,6 @@ class Server:
         session.answered()
         if target_s == 0.0 or target_s > sumo.time_s + ROUNDING_S:
             self._until_step_s = target_s
-        elif math.isnan(target_s):
-            raise FaultError("the controller stepped to time nan")
         else:
             self._answers += status(STEP) + session.results()
 
