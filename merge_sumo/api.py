@@ -83,14 +83,9 @@ from merge_sumo.reports.junit import JUNIT, check_junit, write_junit, write_juni
 from merge_sumo.reports.progress import Bars, CampaignBars, Counter
 from merge_sumo.reports.report import RunningReport, check_report, write_report
 from merge_sumo.result import Shown
-from merge_sumo.road.scenario_file import SUFFIX, name_in_commands
+from merge_sumo.road.scenario_file import SUFFIX
 from merge_sumo.scenario.case import outside_of_the_pool
-from merge_sumo.scenario.scenario import (
-    LEVELS,
-    US23,
-    Scenario,
-    level_name,
-)
+from merge_sumo.scenario.scenario import LEVELS, US23, AnyLevels, Scenario, level_name
 from merge_sumo.simulation.evaluate import simulate
 from merge_sumo.simulation.plan import Engine, SimulationPlan
 from merge_sumo.simulation.povs import parse_levels, policies_folder
@@ -163,7 +158,7 @@ def campaign(config: c.Campaign) -> CampaignRun:
     settings = settings_from_config(config)
     folder = dated(settings.vut) if config.out is None else Path(config.out)
     plan = settings.load_plan()
-    notice_povs(settings, plan, config)
+    notice_povs(settings, plan, config.level)
     check_new(folder)
     return run_and_report(settings, plan, folder, config)
 
@@ -232,7 +227,7 @@ def rerun(config: c.Rerun) -> comparison.Comparison:
     some = len(chosen) < len(before.outcomes)
     if isinstance(before, cases_file.CasesFile) and out is not None and some:
         raise UserError("`out` of a cases file has all cases: name none of them, and no level")
-    with opened_study(before, config, "{vut} again", len(chosen), engine=Engine.SUMO) as study:
+    with opened_study(before, config, "cases again", len(chosen), engine=Engine.SUMO) as study:
         compared = rerunning.rerun(study, chosen)
     if isinstance(before, cases_file.CasesFile):
         compared = with_file(compared, before, out or before.folder)
@@ -255,17 +250,17 @@ def _new_files(config: c.Rerun | c.Compare, ending: str = PAGE) -> tuple[Path | 
 def _written(
     compared: comparison.Comparison, out: Path | None, junit: Path | None
 ) -> comparison.Comparison:
-    """Write the page, or the cases file of now, and JUnit, where they are wanted."""
-    text = compared.text
-    if out is not None and text is not None:
-        check_toml_size(text.encode(errors="backslashreplace"), out)
+    """Write the page, or the present cases file, and JUnit, where they are wanted."""
+    if out is not None:
+        page = compared.text or comparison_page(compared)
+        content = page.encode(errors="backslashreplace")
+        if compared.text is not None:
+            check_toml_size(content, out)
+        write_new(out, content)
+        compared = replace(compared, page_command="")
     if junit is not None:
         write_junit_of_comparison(junit, compared)
-    if out is None:
-        return compared
-    page = comparison_page(compared) if text is None else text
-    write_new(out, page.encode(errors="backslashreplace"))
-    return replace(compared, page_command="")
+    return compared
 
 
 @verb(c.Export)
@@ -488,7 +483,7 @@ def opened_study(
     Args:
         run: the campaign.
         config: how and where cases of it run.
-        title: of the bar; "{vut}" in it stands for the VUT.
+        title: of the bar.
         total: number of cases, which may depend on the engine.
         unit: name of the counted things.
         engine: what moves the vehicles.
@@ -496,7 +491,7 @@ def opened_study(
     settings = settings_from_folder(run.folder, run.record, named_settings(config))
     plan = settings.load_plan().with_engine(engine)
     number = total if isinstance(total, int) else total[plan.engine]
-    bar = Counter(title.format(vut=settings.vut), number, unit, shown=config.progress)
+    bar = Counter(title, number, unit, shown=config.progress)
     with open_workers(plan.workers(config.workers)) as workers, bar:
         yield run_study.RunStudy(run, settings, plan, workers, bar.ended)
 
@@ -557,7 +552,6 @@ def run_and_report(
     parse_gates(config.gates, against=settings.against is not None)
     if junit is not None:
         check_junit(junit, folder)
-    check = config.check or (lambda: None)
     bars = CampaignBars(folder, settings.cases, settings.tolerated, shown=config.progress)
     title = f"{settings.vut} v level {'/'.join(map(level_name, settings.levels))}"
 
@@ -565,7 +559,12 @@ def run_and_report(
         if config.on_case is not None:
             for outcome in outcomes:
                 config.on_case(outcome)
-        check()
+        if config.check is not None:
+            config.check()
+
+    def on_part(title: str, unit: str, done: int, total: int) -> None:
+        bars.counted(title, done, total, unit)
+        on_cases(())
 
     workers = plan.workers(config.workers, settings.cases)
     try:
@@ -577,7 +576,6 @@ def run_and_report(
             )
             result = CampaignRun(done, config.gates)
             study = run_study.RunStudy(done, settings, replace(plan, against=None), available)
-            on_part = partial(_count, bars, check)
             counterfactuals.write_avoidance(
                 study, partial(on_part, "reference drivers", "failures")
             )
@@ -600,33 +598,21 @@ def run_and_report(
     return result
 
 
-def _count(
-    bars: CampaignBars, check: Callable[[], None], title: str, unit: str, done: int, total: int
-) -> None:
-    """Show the progress of a study, and stop it where the user has asked for that."""
-    bars.counted(title, done, total, unit)
-    check()
-
-
-def notice_povs(settings: CampaignSettings, plan: SimulationPlan, config: c.Campaign) -> None:
+def notice_povs(settings: CampaignSettings, plan: SimulationPlan, level: AnyLevels) -> None:
     """Warn with a `Notice` of POVs that are missing, or not trained on the scenario.
 
     Args:
         settings: the settings of a new campaign.
         plan: how its cases run.
-        config: its config.
+        level: the levels as its user has named them.
     """
-    if config.level == "all" and not set(LEVELS) <= set(settings.levels):
+    if level == "all" and not set(LEVELS) <= set(settings.levels):
         present = ", ".join(map(level_name, settings.levels))
         notice(
             f"`level` all: policies are there for level {present}; `merge-sumo train` makes others"
         )
     if {1, 2} & set(settings.levels) and unseen(settings.scenario, plan.povs.policies):
-        scenario = config.scenario or US23
-        name = name_in_commands(scenario) if isinstance(scenario, Scenario) else str(scenario)
-        option = "" if config.policies is None else f" --policies {quoted(config.policies)}"
-        check = f"`merge-sumo scenario check {quoted(name or '')}{option}`"
         notice(
-            f"the POVs of levels 1 and 2 were not trained on {settings.scenario.name}"
-            f"{f': {check} lists the differences' if name else ''}"
+            f"the POVs of levels 1 and 2 were not trained on {settings.scenario.name}: "
+            "`merge-sumo scenario check SCENARIO` lists the differences"
         )

@@ -19,7 +19,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future, wait
 from concurrent.futures.process import ProcessPoolExecutor
-from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass, field
 from numbers import Integral
 from typing import Any, Generic, TypeVar
@@ -260,11 +260,6 @@ def open_workers(workers: AnyWorkers = AUTO) -> Workers:
         )
         count = 1
     return Workers() if count == 1 else Workers(LocalProcesses, count)
-
-
-def workers_or_serial(workers: Workers | None) -> AbstractContextManager[Workers]:
-    """Give workers, which stay open, or this process as the only one."""
-    return open_workers(1) if workers is None else nullcontext(workers)
 
 
 def dask_workers(address: str) -> Workers:

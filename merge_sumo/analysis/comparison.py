@@ -377,7 +377,7 @@ def compare_against(run: RecordedCampaign) -> Comparison | None:
     Returns:
         The comparison; None for a campaign without an earlier version.
     """
-    recorded = run.earlier()
+    recorded = run.read_earlier()
     if recorded is None:
         return None
     # An interrupted campaign may have more cases of the earlier version.

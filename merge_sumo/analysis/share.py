@@ -9,6 +9,7 @@ A search looks for failures, so the share of its own cases that fail is not that
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import nullcontext
 from typing import Annotated
 
 import numpy as np
@@ -23,7 +24,7 @@ from merge_sumo.records import Record
 from merge_sumo.scenario.case import Case, Pool
 from merge_sumo.scenario.scenario import Scenario
 from merge_sumo.simulation.evaluate import evaluate
-from merge_sumo.workers import workers_or_serial
+from merge_sumo.workers import Workers
 
 CASES = 2000
 """Uniform cases of a level: 0 failures among them are less than .15 % of all starts."""
@@ -137,7 +138,7 @@ def write_shares(
     plan = plan.for_verdicts().with_engine(None).with_log(run.folder.resolve() / LOG)
     shares: list[LevelShare] = []
     # Worker processes would take longer to start than the cases by the equations of motion.
-    with workers_or_serial(None if by_equations else study.workers) as workers:
+    with Workers() if by_equations else nullcontext(study.workers) as workers:
         for level in run.levels:
             cases = uniform_cases(plan.scenario, level, count, run.settings.seed)
             try:

@@ -30,7 +30,7 @@ from merge_sumo.scenario.case import Pool
 from merge_sumo.simulation.evaluate import open_simulators
 from merge_sumo.simulation.plan import SimulationPlan, differences
 from merge_sumo.sumo.replay_folder import write_scenario
-from merge_sumo.workers import Workers, workers_or_serial
+from merge_sumo.workers import Workers
 
 EXPORTED_FAILURES = 10
 SCENARIOS = "scenarios"
@@ -60,7 +60,7 @@ def run_campaign(
             named again (`settings_from_folder`).
         plan: how its cases run: that of the settings (`load_plan`).
         folder: where to.
-        callbacks: called in turn with the outcomes of one or more groups when they are stored.
+        callbacks: called in turn with the outcomes of one or more batches when they are stored.
         resumes: whether the folder has a campaign that was stopped, however it was.
         workers: where cases run, by default in this process.
         begin: called before the first case, when nothing is refused any more, with the outcomes of
@@ -81,17 +81,19 @@ def run_campaign(
     plan = plan.for_cases(settings.in_flight or batch or settings.cases)
     plan = plan.with_log(folder.resolve() / LOG)
     history: list[Episode] = []
-    with workers_or_serial(workers) as available, ExitStack() as opened:
+    with ExitStack() as opened:
+        if workers is None:
+            workers = opened.enter_context(Workers())
         if resumes:
-            journal, history = _resumed(settings, plan, folder, opened, available)
+            journal, history = _resumed(settings, plan, folder, opened, workers)
         else:
-            open_simulators(plan, available)
+            open_simulators(plan, workers)
             journal = _created(settings, plan, folder, opened)
         begin([episode.outcome for episode in history])
 
-        def on_batches(groups: Batches) -> None:
-            journal.append(*groups)
-            stored = [episode.outcome for group in groups for episode in group]
+        def on_batches(batches: Batches) -> None:
+            journal.append(*batches)
+            stored = [episode.outcome for batch in batches for episode in batch]
             for callback in callbacks:
                 callback(stored)
 
@@ -99,10 +101,10 @@ def run_campaign(
             _sampler(settings, plan),
             plan,
             settings.cases,
-            workers=available,
+            workers=workers,
             batch=settings.batch,
             draws=settings.repeat,
-            in_flight=settings.in_flight,
+            in_flight=settings.in_flight or 0,
             stop=settings.stopping_rule(),
             history=history,
         )
@@ -110,9 +112,9 @@ def run_campaign(
         done = RecordedCampaign(folder)
         if plan.earlier is not None:
             check_repeatability(
-                RecordedCampaign(folder / AGAINST), settings.earlier, plan.earlier, available
+                RecordedCampaign(folder / AGAINST), settings.earlier, plan.earlier, workers
             )
-        check_repeatability(done, settings, replace(plan, against=None), available)
+        check_repeatability(done, settings, replace(plan, against=None), workers)
     for outcome in spread_failures(done.cases)[:EXPORTED_FAILURES]:
         with suppress(TakenError):  # whatever it is, the campaign has ended
             export_case(done, outcome.index, folder / SCENARIOS / case_name(outcome.index))
@@ -137,46 +139,41 @@ def _resumed(
     workers: Workers,
 ) -> tuple[Journal, list[Episode]]:
     """Return the journal of a folder, which `opened` closes, and the episodes that it has."""
-    journal, before = _reopened(settings, plan, folder, opened)
-    old: RecordedCampaign | None = None
+    journal, run = _reopened(settings, plan, folder, opened)
     if plan.earlier is not None:
-        place = folder / AGAINST
-        if not before.outcomes:  # it may have been stopped before that folder was whole
+        against = folder / AGAINST
+        if not run.outcomes:  # it may have been stopped before that folder was whole
             with suppress(TakenError), ExitStack() as created:
-                _created(settings.earlier, plan.earlier, place, created)
-        journal.earlier, old = _reopened(settings.earlier, plan.earlier, place, opened)
-        before.earlier()  # raises where cases are missing; more of them run again
-        journal.earlier.keep(old, len(before.outcomes))
+                _created(settings.earlier, plan.earlier, against, created)
+        journal.earlier, earlier = _reopened(settings.earlier, plan.earlier, against, opened)
+        run.read_earlier()  # raises where cases are missing; more of them run again
+        journal.earlier.keep(earlier, len(run.outcomes))
     open_simulators(plan, workers)
     journal.write_settings()
-    history = before.episodes()
-    if old is not None:
-        for index, earlier in enumerate(old.episodes()):
-            history[index] = replace(history[index], earlier=earlier)
-    return journal, history
+    return journal, run.episodes()
 
 
 def _reopened(
     settings: CampaignSettings, plan: SimulationPlan, folder: Path, opened: ExitStack
 ) -> tuple[Journal, RecordedCampaign]:
     """Return the journal of a folder, which `opened` closes, and the campaign in it."""
-    journal, before, dropped = Journal.reopen(folder)
+    journal, run, dropped = Journal.reopen(folder)
     opened.enter_context(journal)
     if dropped:
         notice(f"{folder}: dropped {dropped} outcomes of a batch that was stopped; it runs again")
-    journal.settings = _continued(settings, plan, before)
-    return journal, before
+    journal.settings = _continued(settings, plan, run)
+    return journal, run
 
 
 def _continued(
-    settings: CampaignSettings, plan: SimulationPlan, before: RecordedCampaign
+    settings: CampaignSettings, plan: SimulationPlan, run: RecordedCampaign
 ) -> dict[str, Any]:
     """Return the record of a campaign that continues.
 
     Raises `UserError` where something differs that decides outcomes: cases of two controllers are
     not a campaign.
     """
-    recorded, record = dict(before.record), settings.to_record(plan)
+    recorded, record = dict(run.record), settings.to_record(plan)
     # The content of policies decides outcomes, and not their folder.
     recorded["policies"] = record["policies"]
     # Files that were loaded while it ran must be the same, although they are not loaded yet.
@@ -186,13 +183,13 @@ def _continued(
         if name in recorded:
             record[name] = recorded[name]
     # Which cases come next does not depend on how many there are to be.
-    ended = before.settings.stop_when_converged and not settings.stop_when_converged
-    if ended or before.settings.cases < settings.cases:
+    ended = run.settings.stop_when_converged and not settings.stop_when_converged
+    if ended or run.settings.cases < settings.cases:
         recorded |= {"cases": settings.cases, "stop_when_converged": settings.stop_when_converged}
     for name, (was, now) in differences(recorded, record).items():
         same = f"give {was} or more" if name == "cases" else "make it the same"
         raise UserError(
-            f"{name} differs: {before.folder} was run with {was}, now it is {now}; {same}, or "
+            f"{name} differs: {run.folder} was run with {was}, now it is {now}; {same}, or "
             "start a new campaign"
         )
     return record

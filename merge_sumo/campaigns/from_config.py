@@ -14,6 +14,7 @@ from merge_sumo.campaigns.recorded import RecordedCampaign
 from merge_sumo.campaigns.settings import CampaignSettings, settings_from_folder
 from merge_sumo.controllers.in_memory import spec_of_driver
 from merge_sumo.errors import UserError
+from merge_sumo.printable import either
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.scenario.case import Case
 from merge_sumo.scenario.imperfection import Actuation, Sensing
@@ -24,7 +25,15 @@ from merge_sumo.simulation.povs import one_level, parse_levels, policies_folder
 def scenario_from(
     scenario: Scenario | Path | str, changes: Mapping[str, Any] | None = None
 ) -> Scenario:
-    """Return the scenario of a config, with changes by the fields of `ScenarioChanges`."""
+    """Return the scenario of a config.
+
+    Args:
+        scenario: the scenario, its name, or its file.
+        changes: other values, by the fields of `ScenarioChanges`.
+
+    Raises:
+        UserError: an unknown name, or a wrong file or value.
+    """
     named = scenario if isinstance(scenario, Scenario) else named_scenario(str(scenario))
     values = dict(changes or {})
     for name, kind in (("sense", Sensing), ("act", Actuation)):
@@ -107,6 +116,12 @@ def planned_case(config: c.RunCase, run: RecordedCampaign | None) -> tuple[Campa
     Args:
         config: the config.
         run: the campaign, or the cases file, of the recorded case.
+
+    Returns:
+        Settings of a campaign of this case alone, and the case.
+
+    Raises:
+        UserError: no VUT is named, or the case is not one of the scenario.
     """
     if run is None and not config.vut:
         raise UserError("say with `vut` who drives, or with `recorded` which case of a campaign")
@@ -129,21 +144,12 @@ def planned_case(config: c.RunCase, run: RecordedCampaign | None) -> tuple[Campa
     for name in c.COORDINATES:
         if getattr(config, name) is not None:
             values[name] = getattr(config, name)
-    case = case_of(settings.scenario, level, values | dict(config.at or {}))
+    case = _case(settings.scenario, level, values | dict(config.at or {}))
     return settings, replace(case, draw=0 if math.isnan(draw) else int(draw))
 
 
-def case_of(scenario: Scenario, level: int, values: Mapping[str, Any]) -> Case:
-    """Return the case of a scenario with values by the names of its fields.
-
-    Args:
-        scenario: the scenario.
-        level: level of the POV.
-        values: coordinates by the names of `outcomes.jsonl`, in m, m/s, s and rad.
-
-    Raises:
-        UserError: a coordinate is missing or unknown, or a value is out of range.
-    """
+def _case(scenario: Scenario, level: int, values: Mapping[str, Any]) -> Case:
+    """Return the case of a scenario with values by the names of its coordinates."""
     known = {"v_vut0_mps"}
     for dimension in scenario.dimensions(level):
         known.add(dimension.field)
@@ -152,18 +158,18 @@ def case_of(scenario: Scenario, level: int, values: Mapping[str, Any]) -> Case:
                 f"{_option(dimension.field)} is missing: the pool has {dimension.low:g} to "
                 f"{dimension.high:g}"
             )
-    given: dict[str, Any] = {}
+    numbers: dict[str, Any] = {}
     if isinstance(scenario.v_vut0_mps, float):
-        given["v_vut0_mps"] = scenario.v_vut0_mps
+        numbers["v_vut0_mps"] = scenario.v_vut0_mps
     for name, value in values.items():
         if name not in known:
             raise UserError(
-                f"{_option(name)} is none of the coordinates of {scenario.name} at level "
-                f"{level_name(level)}, which are {', '.join(sorted(known))}: leave it out"
+                f"{_option(name)} is not a coordinate of {scenario.name} at level "
+                f"{level_name(level)}: leave it out, or name {either(sorted(known))}"
             )
         if value is not None:
-            given[name] = _number(name, value)
-    return Case(level=level, scenario=scenario, **given)
+            numbers[name] = _number(name, value)
+    return Case(level=level, scenario=scenario, **numbers)
 
 
 def _number(name: str, value: Any) -> float:

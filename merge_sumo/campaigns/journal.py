@@ -1,6 +1,6 @@
-"""The writer of a campaign folder (`recorded.py`): one process, and whole groups of episodes.
+"""The writer of a campaign folder (`recorded.py`): one process, and whole batches of episodes.
 
-The trajectories of a group go first, so that every outcome on disk has its trajectory there.
+The trajectories of a batch go first, so that every outcome on disk has its trajectory there.
 """
 
 from __future__ import annotations
@@ -43,7 +43,11 @@ from merge_sumo.scenario.signals import to_runs
 
 
 def to_line(outcome: Outcome) -> str:
-    """Return the line of `outcomes.jsonl` for an outcome, with its line end."""
+    """Return the line of `outcomes.jsonl` for an outcome, with its line end.
+
+    Args:
+        outcome: the outcome.
+    """
     return json.dumps(outcome.to_record(), allow_nan=False) + "\n"
 
 
@@ -51,6 +55,10 @@ class Journal:
     """Writes a campaign's folder, as the only process that does; to be used in `with`.
 
     A folder with settings is complete, and appended outcomes stay.
+
+    Example:
+        with Journal.create(folder, settings.to_record(plan)) as journal:
+            journal.append(episodes)
 
     Attributes:
         folder: the folder.
@@ -74,7 +82,15 @@ class Journal:
 
     @classmethod
     def create(cls, folder: Path, settings: dict[str, Any]) -> Self:
-        """Create the folder with its settings; `UserError` when it exists or cannot be written."""
+        """Create a folder with its settings, and return its journal.
+
+        Args:
+            folder: the folder.
+            settings: content of its `campaign.json`.
+
+        Raises:
+            UserError: it exists or cannot be written.
+        """
         write_folder(folder, {OUTCOMES: b"", SETTINGS: to_json(settings, indent=2)})
         return cls(folder, (folder / OUTCOMES).open("r+b", buffering=0), settings)
 
@@ -83,6 +99,9 @@ class Journal:
         """Return the journal of a stopped campaign, the campaign, and the number of lost outcomes.
 
         The outcomes of a batch that was not written to its end are dropped: its cases run again.
+
+        Args:
+            folder: the folder of the campaign.
 
         Raises:
             UserError: another process writes the folder, a link in it leads elsewhere, or
@@ -106,32 +125,42 @@ class Journal:
         return journal, run, dropped
 
     def keep(self, run: RecordedCampaign, cases: int) -> None:
-        """Drop all outcomes of a run after its first cases, from the folder and from memory."""
+        """Drop outcomes from the end, from the folder and from memory.
+
+        Args:
+            run: the campaign of this journal.
+            cases: number of the first cases that stay.
+        """
         del run.outcomes[cases:]
         self._outcomes.seek(0)
         length = sum(len(line) for line, _ in zip(self._outcomes, run.outcomes, strict=False))
         self._outcomes.truncate(length)
         os.fsync(self._outcomes.fileno())
 
-    def append(self, *groups: Sequence[Episode]) -> None:
-        """Write groups and sync them to the disk.
+    def append(self, *batches: Sequence[Episode]) -> None:
+        """Write batches and sync them to the disk.
 
-        Loaded files, commands without effect and retried cases are noted in the settings. Raises
-        `UserError` when the groups cannot be written; earlier groups stay.
+        Loaded files, commands without effect and retried cases are noted in the settings.
+
+        Args:
+            batches: the episodes of each batch.
+
+        Raises:
+            UserError: they cannot be written; earlier batches stay.
         """
         if self.earlier is not None:
             earlier = []
-            for group in groups:
-                earlier.append([episode.earlier for episode in group if episode.earlier])
+            for batch in batches:
+                earlier.append([episode.earlier for episode in batch if episode.earlier])
             self.earlier.append(*earlier)
-        episodes = list(chain.from_iterable(groups))
+        episodes = list(chain.from_iterable(batches))
         lines = "".join(to_line(episode.outcome) for episode in episodes)
         try:
             end = self._outcomes.seek(0, os.SEEK_END)
-            for group in groups:
-                path = batch_file(self.folder, group[0].outcome.batch)
+            for batch in batches:
+                path = batch_file(self.folder, batch[0].outcome.batch)
                 with path.open("wb", buffering=0) as file:
-                    _write_all(file, _arrays(group))
+                    _write_all(file, _arrays(batch))
             sync_folder(self.folder / TRAJECTORIES)
             try:
                 _write_all(self._outcomes, lines.encode())
@@ -151,7 +180,7 @@ class Journal:
             self.write_settings()
 
     def _note(self, episode: Episode) -> None:
-        """Note loaded files, commands without effect and retries of an episode in the settings."""
+        """Note in the settings what an episode has loaded, commanded in vain, or repeated."""
         noted = self.settings
         for name, files in zip(FILES, (episode.files, episode.pov_files), strict=True):
             if files:
@@ -175,10 +204,10 @@ class Journal:
         self._outcomes.close()
 
 
-def _arrays(group: Sequence[Episode]) -> bytes:
-    """Return the file of the trajectories of a group."""
+def _arrays(batch: Sequence[Episode]) -> bytes:
+    """Return the file of the trajectories of a batch."""
     indices, rows, motions, signals = [], [], [], {}
-    for episode in group:
+    for episode in batch:
         index, trajectory = episode.outcome.index, episode.trajectory
         indices.append(index)
         rows.append(len(trajectory.whole))

@@ -69,7 +69,7 @@ class SearchLoop:
         workers: Workers | None = None,
         batch: int | None = None,
         draws: int = 1,
-        in_flight: int | None = None,
+        in_flight: int = 0,
         stop: Callable[[Sequence[Outcome]], bool] | None = None,
         history: Iterable[Episode] = (),
     ) -> None:
@@ -82,7 +82,7 @@ class SearchLoop:
             workers: where they run; by default in this process, whose simulator stays open.
             batch: cases of a batch; by default the number that the sampler wants.
             draws: runs of each case that the sampler proposes. All are in one batch.
-            in_flight: most cases in flight; by default one batch.
+            in_flight: most cases in flight; 0 for one batch.
             stop: whether the outcomes with a verdict end the search.
             history: whole batches that ran before, in order.
         """
@@ -92,7 +92,7 @@ class SearchLoop:
         self._workers = Workers() if workers is None else workers
         self._batch_size, self._draws, self._in_flight = batch, draws, in_flight
         self._ahead = not sampler.learns and stop is None
-        self._overlaps = in_flight is not None and sampler.overlaps
+        self._overlaps = in_flight > 0 and sampler.overlaps
         batches = groupby(history, key=lambda episode: episode.outcome.batch)
         self._history = deque(list(batch) for _, batch in batches)
         self._pending: list[_Batch] = []
@@ -171,7 +171,7 @@ class SearchLoop:
         """Return the number of cases of the next batch."""
         if self._history:
             return len(self._history[0])
-        if self._in_flight is None:
+        if not self._in_flight:
             size = self._batch_size or self._sampler.batch_size()
         elif self._overlaps:
             size = max(1, self._most_in_flight() // BATCHES_IN_FLIGHT)
@@ -182,9 +182,8 @@ class SearchLoop:
     def _most_in_flight(self) -> int:
         """Return how many cases may be in flight by now.
 
-        Fewer than N in a young search: the less is known, the more is the next outcome worth.
+        Fewer at the beginning of a search: the less is known, the more the next outcome is worth.
         """
-        assert self._in_flight is not None, "N is given"  # noqa: S101
         return min(self._in_flight, self._sampler.batch_size() + self._cases_proposed // AGE)
 
     def _add(self, batch: _Batch) -> _Batch:
@@ -211,17 +210,24 @@ class SearchLoop:
 
 
 def tell(sampler: Sampler, episodes: Sequence[Episode]) -> None:
-    """Tell a sampler the outcomes of episodes, or where they ran with two versions, regressions."""
+    """Tell a sampler the outcomes of episodes.
+
+    Args:
+        sampler: the sampler.
+        episodes: episodes in the order of their cases. Where each has that of the earlier version,
+            the sampler is told regressions.
+    """
     earlier = [episode.earlier for episode in episodes if episode.earlier is not None]
     outcomes = [episode.outcome for episode in episodes]
     if earlier:
+        earlier_outcomes = [episode.outcome for episode in earlier]
         if isinstance(sampler.predictor, ControllerModelPair):
-            sampler.predictor.tell_old([one.outcome for one in earlier], motions_of(earlier))
-        pairs = zip(outcomes, earlier, strict=True)
-        outcomes = [regression(new, old.outcome, old.outcome.prediction) for new, old in pairs]
-    sampler.tell(outcomes, motions_of(episodes))
+            sampler.predictor.tell_old(earlier_outcomes, _motions(earlier))
+        for place, other in enumerate(earlier_outcomes):
+            outcomes[place] = regression(outcomes[place], other, other.prediction)
+    sampler.tell(outcomes, _motions(episodes))
 
 
-def motions_of(episodes: Iterable[Episode]) -> dict[int, FloatArray]:
+def _motions(episodes: Iterable[Episode]) -> dict[int, FloatArray]:
     """Return the motions of episodes, (T + 1, A, 3), by index."""
     return {episode.outcome.index: episode.trajectory.motion for episode in episodes}

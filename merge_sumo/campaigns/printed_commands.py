@@ -1,6 +1,6 @@
-"""Commands that the package prints for a user to run, with the controllers that they need.
+"""Commands that are printed for a user to run: of a shell, or calls of Python.
 
-They are shell commands, or calls of Python where a controller is an object of this process.
+A call of Python stands where a controller is an object of this process.
 """
 
 from __future__ import annotations
@@ -43,13 +43,13 @@ def campaign_command(
         arguments: further arguments after the folder.
         options: options by keyword; a controller replaces the recorded one, None is left out.
     """
-    named: dict[str, Argument | None] = {}
-    for name in CONTROLLERS:
+    named = dict(options)
+    # `settings_from_folder` asks for code again. Only a campaign has two versions.
+    for name in CONTROLLERS if verb == "resume" else CONTROLLERS[:2]:
         spec = record.get(name)
-        # `settings_from_folder` asks for code again. Only a campaign has two versions.
-        if isinstance(spec, str) and runs_code(spec) and (name != "against" or verb == "resume"):
-            named[name] = spec
-    return command(verb, folder, *arguments, **{**named, **options})
+        if isinstance(spec, str) and runs_code(spec):
+            named.setdefault(name, spec)
+    return command(verb, folder, *arguments, **named)
 
 
 def command(verb: str, *arguments: Argument, **options: Argument | None) -> str:
@@ -81,7 +81,13 @@ def command(verb: str, *arguments: Argument, **options: Argument | None) -> str:
 
 
 def call(verb: str, *arguments: Argument, **options: Argument) -> str:
-    """Return a call of Python, in which `ms` is this package; as `command`."""
+    """Return a call of Python, in which `ms` is this package.
+
+    Args:
+        verb: name of a function of the API.
+        arguments: arguments in their order.
+        options: options by keyword.
+    """
     parts = list(map(_expression, arguments))
     if verb == "run" and parts:
         parts = [f"recorded=({', '.join(parts)})"]
@@ -121,10 +127,8 @@ def _folder_of_module(spec: ControllerSpec) -> str:
     folder = Path(file).resolve().parent
     if Path(file).name == "__init__.py":
         folder = folder.parent
-    searched = [Path.cwd()]
-    for installed in sysconfig.get_paths().values():
-        searched.append(Path(installed).resolve())
-    return "" if folder in searched else str(folder)
+    installed = map(Path, sysconfig.get_paths().values())
+    return "" if folder in (Path.cwd(), *installed) else str(folder)
 
 
 def _controller(text: str) -> str:

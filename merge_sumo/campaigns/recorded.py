@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from itertools import groupby
 from pathlib import Path
 from typing import Annotated, Any, Final, TypeVar
@@ -191,13 +191,10 @@ class RecordedCampaign:
 
     @property
     def ran_again_in_words(self) -> str:
-        """A sentence on the cases that ran again; empty where none did."""
-        number = self.settings.ran_again
-        if not number:
-            return ""
+        """A sentence on the number of cases that ran again."""
         return (
-            f"{counted(number, 'case')} ran again, because a process was killed or stopped; the "
-            "outcome is that of the last time."
+            f"{counted(self.settings.ran_again, 'case')} ran again, because a process was "
+            "killed or stopped; the outcome is that of the last time."
         )
 
     def outcome(self, index: int) -> Outcome:
@@ -241,14 +238,29 @@ class RecordedCampaign:
         return known
 
     def episodes(self) -> list[Episode]:
-        """Return all cases in order. Raises as `trajectory` does."""
-        return [Episode(outcome, self.trajectory(outcome.index)) for outcome in self.outcomes]
+        """Return all episodes in order, with those of the earlier version, where there is one.
 
-    def earlier(self) -> RecordedCampaign | None:
-        """Return the run of the version that this campaign is against; None where there is none.
+        Raises:
+            UserError: as of `trajectory` and `read_earlier`.
+        """
+        earlier = self.read_earlier()
+        episodes = []
+        for outcome in self.outcomes:
+            episode = Episode(outcome, self.trajectory(outcome.index))
+            if earlier is not None:
+                other = earlier.outcomes[outcome.index]
+                other_episode = Episode(other, earlier.trajectory(other.index))
+                episode = replace(episode, earlier=other_episode)
+            episodes.append(episode)
+        return episodes
 
-        Raises `UserError` where that is missing, or has other cases. Of a campaign that was stopped
-        it may have more of them.
+    def read_earlier(self) -> RecordedCampaign | None:
+        """Return the run of the version that this campaign is against; None without one.
+
+        Of a campaign that was stopped it may have more cases.
+
+        Raises:
+            UserError: it is missing, or has other cases.
         """
         if self.settings.against is None:
             return None
@@ -394,22 +406,22 @@ def spread_failures(outcomes: Iterable[Outcome]) -> list[Outcome]:
 def has_converged(outcomes: Sequence[Outcome], tolerated: float = 0.0) -> bool:
     """Return whether the last cases added little to the coverage of all levels together.
 
-    This is a pure function of the outcomes in the order of their index, so a resumed campaign ends
-    where it would have ended. A search without a failure continues. A region of failures without a
-    case near it is in no coverage: the rule saves cases and proves nothing.
+    A search without a failure continues. A region of failures without a case near it is in no
+    coverage: the rule saves cases and proves nothing.
 
     Args:
-        outcomes: the outcomes.
+        outcomes: the outcomes, in the order of their index. They alone decide, so a resumed
+            campaign ends where it would have ended.
         tolerated: the share of its runs in which a case may fail.
     """
-    before = sum(coverage_by_level(outcomes[:-WINDOW], tolerated).values())
-    return sum(coverage_by_level(outcomes, tolerated).values()) < (1.0 + MIN_GROWTH) * before
+    before = _coverage(outcomes[:-WINDOW], tolerated)
+    return _coverage(outcomes, tolerated) < (1.0 + MIN_GROWTH) * before
 
 
-def coverage_by_level(outcomes: Sequence[Outcome], tolerated: float = 0.0) -> dict[int, float]:
-    """Return the failure mode coverage of each level with failures."""
+def _coverage(outcomes: Sequence[Outcome], tolerated: float) -> float:
+    """Return the sum of the failure mode coverage of all levels."""
     by_level = _by_level(failing_cases(outcomes, tolerated))
-    return {level: fmc(points) for level, (_, points) in by_level.items()}
+    return sum(fmc(points) for _, points in by_level.values())
 
 
 def batch_file(folder: Path, batch: int) -> Path:

@@ -78,28 +78,31 @@ def check_repeatability(
     Returns:
         A comparison for each case, by index.
     """
-    chosen = cases_to_repeat(run.outcomes, settings)
-    if not chosen:
+    outcomes = cases_to_repeat(run.outcomes, settings)
+    if not outcomes:
         return []
-    found = []
-    cases = [outcome.case for outcome in chosen]
+    second_runs = []
+    cases = [outcome.case for outcome in outcomes]
     job = workers.submit(
         partial(simulate_part, plan, keep=with_measures), cases, partial(lost, plan)
     )
-    for outcome, ran in zip(chosen, workers.collect(job), strict=True):
-        if not ran.outcome.measures.end.is_error:  # of a slow machine, perhaps
-            found.append(second_run_of(outcome, run.trajectory(outcome.index), ran))
-    found.sort(key=lambda one: one.index)
-    replace_own(run.folder / REPEATS, b"".join(map(to_json, found)), b'"index"')
-    return found
+    for outcome, episode in zip(outcomes, workers.collect(job), strict=True):
+        if not episode.outcome.measures.end.is_error:  # of a slow machine, perhaps
+            second_runs.append(second_run_of(outcome, run.trajectory(outcome.index), episode))
+    second_runs.sort(key=lambda second: second.index)
+    replace_own(run.folder / REPEATS, b"".join(map(to_json, second_runs)), b'"index"')
+    return second_runs
 
 
 def cases_to_repeat(outcomes: Sequence[Outcome], settings: CampaignSettings) -> list[Outcome]:
     """Return the outcomes of the cases that are to run again, in that order.
 
-    Only those of `may_not_repeat`. Half are the first cases, which a new controller ran; the others
-    are spread over the campaign, and run before those. Errors may be a slow machine's doing, and
-    are left out.
+    Half are the first cases, which a new controller ran; the others are spread over the campaign,
+    and run before those. Errors are left out: a slow machine may have caused them.
+
+    Args:
+        outcomes: all outcomes of the campaign.
+        settings: its settings.
     """
     candidates = may_not_repeat(outcomes, settings)
     tested = [outcome for outcome in candidates if not outcome.measures.end.is_error]
@@ -113,6 +116,10 @@ def may_not_repeat(outcomes: Iterable[Outcome], settings: CampaignSettings) -> l
     """Return the outcomes of the cases in which something drives that may not repeat itself.
 
     A TraCI client that a user starts has none: it may have ended.
+
+    Args:
+        outcomes: outcomes of a campaign.
+        settings: its settings.
     """
     if waits_for_client(settings.vut):
         return []
@@ -121,19 +128,18 @@ def may_not_repeat(outcomes: Iterable[Outcome], settings: CampaignSettings) -> l
     return [one for one in outcomes if own_vut or (own_pov and one.case.level == OWN)]
 
 
-def second_run_of(outcome: Outcome, recorded: Trajectory, ran: Episode) -> SecondRun:
+def second_run_of(outcome: Outcome, trajectory: Trajectory, second: Episode) -> SecondRun:
     """Return how the second run of a case compares with the first one.
 
     Args:
         outcome: outcome of the first run.
-        recorded: trajectory of the first run.
-        ran: the second run.
+        trajectory: trajectory of the first run.
+        second: the second run.
     """
-    differs_from_s, first = _difference(recorded, ran.trajectory)
-    now = ran.outcome
-    end = now.measures.end
-    other = (end, now.failed) != (outcome.measures.end, outcome.failed)
-    return SecondRun(outcome.index, differs_from_s, first, end, now.failed, other)
+    differs_from_s, first = _difference(trajectory, second.trajectory)
+    end, failed = second.outcome.measures.end, second.outcome.failed
+    other_verdict = (end, failed) != (outcome.measures.end, outcome.failed)
+    return SecondRun(outcome.index, differs_from_s, first, end, failed, other_verdict)
 
 
 def _difference(one: Trajectory, other: Trajectory) -> tuple[float | None, Vehicle | None]:
@@ -154,24 +160,34 @@ def _difference(one: Trajectory, other: Trajectory) -> tuple[float | None, Vehic
 
 
 def read_second_runs(run: RecordedCampaign) -> list[SecondRun]:
-    """Read the comparisons of a campaign; `UserError` for a wrong line."""
+    """Read the comparisons of a campaign.
+
+    Args:
+        run: the campaign.
+
+    Raises:
+        UserError: a line is not as it was written.
+    """
     return read_indexed(run.folder / REPEATS, SecondRun, range(len(run.outcomes)))
 
 
-def unrepeatable(found: Iterable[SecondRun]) -> str | None:
-    """Return a sentence on the cases that did not repeat; None where each did."""
-    known = list(found)
-    differing = [one for one in known if not one.same]
+def unrepeatable(second_runs: Sequence[SecondRun]) -> str | None:
+    """Return a sentence on the cases that did not repeat; None where each did.
+
+    Args:
+        second_runs: all cases that ran twice.
+    """
+    differing = [second for second in second_runs if not second.same]
     if not differing:
         return None
-    verdicts = [one for one in differing if one.other_verdict]
+    verdicts = [second for second in differing if second.other_verdict]
     example = (verdicts or differing)[0]
     since = "" if example.differs_from_s is None else f" from {example.differs_from_s:g} s on"
-    firsts = {one.first for one in differing}
+    firsts = {second.first for second in differing}
     who = "VUT or the POV" if len(firsts) > 1 else str(firsts.pop() or "VUT or the POV").upper()
     return (
-        f"Not repeatable: {len(differing)} of {counted(len(known), 'case')} that ran twice went "
-        f"differently the second time, {len(verdicts) or 'none'} of them with another verdict "
+        f"Not repeatable: {len(differing)} of {counted(len(second_runs), 'case')} that ran twice "
+        f"went differently the second time, {len(verdicts) or 'none'} of them with another verdict "
         f"(case {example.index}{since}). Either the {who} draws random numbers or reads a clock, "
         "or it keeps something from earlier episodes: a result depends on more than its case, and "
         "other workers or another order may give others."

@@ -64,21 +64,6 @@ def named_scenario(name: str) -> Scenario:
     return replace(scenario, net=str((Path(name).parent / scenario.net).resolve()))
 
 
-def name_in_commands(scenario: Scenario) -> str | None:
-    """Return the name by which commands in the working folder find a scenario.
-
-    Args:
-        scenario: the scenario.
-
-    Returns:
-        Its name or its file; None where a command finds neither.
-    """
-    if scenario.name in shipped_scenarios():
-        return scenario.name
-    file = f"{scenario.name}{SUFFIX}"
-    return file if Path(file).is_file() else None
-
-
 def _read(path: Path) -> Scenario:
     """Return the scenario of a file, with its net as the file names it."""
     text, record = read_toml(path, "scenario")

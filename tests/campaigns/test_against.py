@@ -77,13 +77,13 @@ class TestFinds:
 
     def test_the_old_version_is_a_campaign_of_its_own(self):
         run = run_campaign(settings(cases=10), Path("run"))
-        earlier = run.earlier()
+        earlier = run.read_earlier()
         assert earlier.settings.vut == "old.py:f"
         assert all(o.measures.dx_m == pytest.approx(gap_m(o.case, 0.0)) for o in earlier.outcomes)
         path = Path("run") / AGAINST / OUTCOMES
         path.write_bytes(b"".join(path.read_bytes().splitlines(keepends=True)[:5]))
         with pytest.raises(UserError, match="against does not have the cases of run"):
-            run.earlier()
+            run.read_earlier()
 
 
 def test_the_bytes_are_the_same_after_a_stop_between_the_two_versions():

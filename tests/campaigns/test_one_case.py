@@ -68,7 +68,7 @@ class TestTheCommand:
             (SAFE, "say with --vut who drives"),
             (("--vut", "my_vut.py", *SAFE), "my_vut.py:NAME"),
             (("--vut", "design2", "--x", "-300"), "--v is missing"),
-            (("--vut", "design2", *SAFE, "--psi", "0.2"), "--psi is none of"),
+            (("--vut", "design2", *SAFE, "--psi", "0.2"), "--psi is not a coordinate of"),
             (("--vut", "design2", *SAFE[2:], "--level", "all"), "--level all"),
             (("--case", "nowhere", "3"), "is not a campaign: cannot read"),
         ],

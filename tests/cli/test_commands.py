@@ -64,7 +64,6 @@ class TestOptions:
             (["campaign", "--samplr", "gpr"], "Did you mean --sampler?"),
             (["campain"], 'Did you mean "campaign"?'),
             (["campaign", "--cases", "few"], "--cases"),
-            (["campaign", "--cases", "--seed", "3"], "--cases needs a value before --seed"),
             (["campaign", "--seed", "1", "--seed", "2"], "--seed specified multiple times"),
             (["run", "--at", "x_pov0_m"], "give NAME=NUMBER"),
             (["run", "--at", "x_pov0_m=1", "x_pov0_m=2"], "x_pov0_m twice"),

@@ -10,7 +10,6 @@ import subprocess
 import sys
 import warnings
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,10 +21,7 @@ from support.campaigning import campaign_settings, run_campaign
 import merge_sumo as ms
 from merge_sumo import testing
 from merge_sumo.campaigns.printed_commands import campaign_command, command
-from merge_sumo.errors import Notice
 from merge_sumo.interrupt import Stopped
-from merge_sumo.road.scenario_file import to_toml
-from merge_sumo.scenario.scenario import US23
 
 Call = Callable[..., Said]
 
@@ -205,17 +201,6 @@ class TestACommand:
             ["/bin/sh", "-c", text], env=environment, capture_output=True, text=True, check=False
         )
         assert done.returncode == 1, done.stderr
-
-    @pytest.mark.parametrize("file", ["mine.toml", "elsewhere.toml"])
-    @pytest.mark.usefixtures("place")
-    def test_on_a_scenario_names_its_file_or_is_left_out(self, file):
-        scenario = replace(US23, name="mine", v_pov0_mps=(12.0, 20.0))
-        Path(file).write_text(to_toml(scenario, []))
-        few: dict[str, Any] = {"level": 1, "cases": 4, "seed": 1, "progress": False}
-        with pytest.warns(Notice, match="not trained on mine") as noticed:
-            ms.campaign("design1", scenario=scenario, **few, out="run")
-        found = set(commands_in("\n".join(str(one.message) for one in noticed)))
-        assert found == ({"merge-sumo scenario check mine.toml"} if file == "mine.toml" else set())
 
 
 def test_an_explanation_by_another_vut_names_it(command_line, tmp_path):
