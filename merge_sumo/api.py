@@ -551,7 +551,7 @@ def run_and_report(
     junit = path_of(config.junit)
     parse_gates(config.gates, against=settings.against is not None)
     if junit is not None:
-        check_junit(junit, folder)
+        check_junit(junit)
     bars = CampaignBars(folder, settings.cases, settings.tolerated, shown=config.progress)
     title = f"{settings.vut} v level {'/'.join(map(level_name, settings.levels))}"
 
@@ -594,7 +594,7 @@ def run_and_report(
             stop.add_note(f"continue with: {command}")
         raise
     if junit is not None:
-        write_junit(junit, done, result.facts, result.summary, result.gates)
+        write_junit(junit, result)
     return result
 
 

@@ -29,7 +29,7 @@ from merge_sumo.metrics.summary import (
 from merge_sumo.printable import printable
 from merge_sumo.records import to_plain
 from merge_sumo.reports.comparison_page import AGAINST_PAGE
-from merge_sumo.reports.facts import Fact, facts_of
+from merge_sumo.reports.facts import REPEATED, Fact, facts_of
 from merge_sumo.reports.text import comparison_headline, episode_lines, headline, transitions
 from merge_sumo.result import Result
 from merge_sumo.road.scenario_file import SUFFIX
@@ -208,7 +208,7 @@ class CampaignRun(Result):
         repeated = [
             f"{fact.name}: {fact.shown}"
             for fact in self.facts
-            if fact.level is None and fact.name == "cases that ran more than once"
+            if fact.level is None and fact.name == REPEATED
         ]
         tested, *found = headline(run, self.facts)
         optional = [

@@ -19,34 +19,44 @@ from merge_sumo.scenario.scenario import DT_S, VEHICLES, VUT
 SHOWN = 200
 """Maximum number of cases of a change of version that are drawn, in the order of tables."""
 DRAWN = (
-    *(Change.BROKE, Change.WITHIN_CHANCE, Change.NOT_REPEATABLE, Change.NEITHER),
-    *(Change.STILL_CONTACT, Change.FIXED),
+    Change.BROKE,
+    Change.WITHIN_CHANCE,
+    Change.NOT_REPEATABLE,
+    Change.NEITHER,
+    Change.STILL_CONTACT,
+    Change.FIXED,
 )
-"""Changes of which a section has both motions of each case; the template says what they mean."""
+"""Changes that have a section with both motions of each case; the template explains them."""
 PAGE = ".html"
-"""Ending of a page: a browser shows a file with another one as source."""
+"""Ending of a page; a browser shows a file with another ending as source."""
 AGAINST_PAGE = f"{AGAINST}{PAGE}"
 """Page in the folder of a campaign against an earlier version."""
 STYLES = ("report.css", "comparison.css")
 
 
 def write_against(run: RecordedCampaign) -> None:
-    """Write the page of a campaign against an earlier version into its folder; else do nothing."""
+    """Write the page of a campaign against an earlier version into its folder.
+
+    Args:
+        run: the campaign; without an earlier version nothing is written.
+
+    Raises:
+        UserError: it cannot be written, or merge-sumo did not create the file in its place.
+    """
     compared = compare_against(run)
     if compared is not None:
-        html = comparison_page(compared)
-        content = html.encode(errors="backslashreplace")
+        content = comparison_page(compared).encode(errors="backslashreplace")
         replace_own(run.folder / AGAINST_PAGE, content, GENERATOR)
 
 
 def comparison_page(compared: Comparison) -> str:
-    """Return the page of a comparison as HTML."""
+    """Return the page of a comparison as HTML.
+
+    Args:
+        compared: the comparison.
+    """
     rows = [(one, _maps(one), _sections(one, compared)) for one in compared.version_changes]
-    vehicles = max(
-        outcome.case.scenario.vehicles
-        for version in compared.versions
-        for outcome in version.outcomes[:1]
-    )
+    outcomes = [version.outcomes[0] for version in compared.versions if version.outcomes]
     return page(
         "comparison.html.jinja",
         styles=STYLES,
@@ -55,7 +65,7 @@ def comparison_page(compared: Comparison) -> str:
         fmc=fmc_rows(compared),
         change_in_words=change_in_words,
         version_changes=rows,
-        vehicles=vehicles,
+        vehicles=outcomes[0].case.scenario.vehicles,
     )
 
 

@@ -6,7 +6,6 @@ Report, terminal, JSON and JUnit take their numbers from this list.
 from __future__ import annotations
 
 import statistics
-from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import partial
@@ -32,19 +31,30 @@ from merge_sumo.metrics.summary import LevelSummary, Summary, by_case
 from merge_sumo.printable import printable
 
 PERCENT = "%"
-STARTS_THAT_FAIL = "starts that fail"
-STARTS = "uniform starts of that"
-UNDECIDED = "undecided"
+SCATTERED = "scattered"
+"""Regions of a level whose failures mostly lie alone."""
+
+# Names of facts that the terminal and the templates look up.
+VUT = "VUT"
 RULE = "a case fails when"
+CASES = "cases"
 AT_MOST = "cases at most; the search converged before"
+ERRORS = "errors"
+TIMEOUTS = "timeouts"
+FAILURES = "failures"
+UNDECIDED = "undecided"
 CONTACT = "cases with contact that are no failures"
+REGIONS = "regions"
+FMC = "FMC"
+STARTS_THAT_FAIL = "starts that fail"
+STARTS = "uniform starts simulated"
+REPEATED = "cases that ran more than once"
 DRIVEN = "failures that reference drivers drove"
 AVOIDED = "failures that driver {} avoids"
 AVOIDED_BY_POV = "failures that a careful POV avoids"
-PROBABLY = "probability that a case fails"
+PROBABILITY_TO_FAIL = "probability that a case fails"
 WORST = "worst case"
 KIND = "kind of the worst case"
-SCATTERED = "scattered"
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,9 +63,9 @@ class Fact:
 
     Attributes:
         name: name of the quantity.
-        value: a number in `unit`, or a text.
+        value: number in `unit`, or a text.
         key: key in the file, or a condition on the lines that are counted.
-        unit: "" for counts, for texts and for FMC.
+        unit: unit of a number; empty for counts, for texts and for FMC.
         file: source file in the run folder.
         level: POV level; None for the whole campaign.
 
@@ -93,15 +103,20 @@ def facts_of(run: RecordedCampaign, summary: Summary) -> list[Fact]:
 
     Args:
         run: the campaign.
-        summary: its summary.
+        summary: its summary, with all levels.
 
     Raises:
         UserError: a file of a study is damaged.
+
+    Example:
+        >>> facts = facts_of(run, summarise(run.outcomes, run.levels, run.tolerated))
+        >>> facts[0].name, facts[0].shown
+        ('VUT', 'design2')
     """
     failing = run.criterion.condition if run.criterion.is_papers else "margin < 0"
     facts = [*_settings(run), *_shares(run), *_counts(run, summary, failing)]
-    for level, found in summary.levels.items():
-        facts += _of_level(run, level, found, failing)
+    for level in summary.levels:
+        facts += _of_level(run, level, summary.levels[level], failing)
     facts += _repeats(run)
     facts += _motion(run, summary.undecided_cases, failing)
     facts += _avoided(run, summary.undecided_cases)
@@ -110,7 +125,11 @@ def facts_of(run: RecordedCampaign, summary: Summary) -> list[Fact]:
 
 
 def by_level(facts: Iterable[Fact]) -> dict[int, dict[str, Fact]]:
-    """Return the facts of each level by name."""
+    """Return the facts of each POV level by name.
+
+    Args:
+        facts: facts of a campaign; those of the whole campaign are left out.
+    """
     rows: dict[int, dict[str, Fact]] = {}
     for fact in facts:
         if fact.level is not None:
@@ -120,7 +139,7 @@ def by_level(facts: Iterable[Fact]) -> dict[int, dict[str, Fact]]:
 
 def _settings(run: RecordedCampaign) -> Facts:
     settings, criterion = run.settings, run.criterion
-    yield Fact("VUT", run.vut, "vut", file=SETTINGS)
+    yield Fact(VUT, run.vut, "vut", file=SETTINGS)
     yield Fact("scenario", run.scenario.name, "scenario.name", file=SETTINGS)
     key = "fail_when" if criterion.require is None else "require"
     yield Fact(RULE, criterion.description(run.scenario), key, file=SETTINGS)
@@ -143,42 +162,37 @@ def _shares(run: RecordedCampaign) -> Facts:
 
 
 def _counts(run: RecordedCampaign, summary: Summary, failing: str) -> Facts:
-    yield Fact("cases", summary.cases, "lines")
+    yield Fact(CASES, summary.cases, "lines")
     if run.converged:
         yield Fact(AT_MOST, run.settings.cases, "cases", file=SETTINGS)
     if summary.errors:
-        yield Fact("errors", summary.errors, "end: VUT_ERROR, SIM_ERROR")
+        yield Fact(ERRORS, summary.errors, "end: VUT_ERROR, SIM_ERROR")
     if summary.timeouts:
-        yield Fact("timeouts", summary.timeouts, "end: TIMEOUT")
-    yield Fact("failures", summary.failures, failing)
+        yield Fact(TIMEOUTS, summary.timeouts, "end: TIMEOUT")
+    yield Fact(FAILURES, summary.failures, failing)
     if run.tolerated:
         yield Fact(UNDECIDED, summary.undecided, "draw")
     if summary.failures:
         yield Fact("failures with contact", summary.contacts, f"{failing}, severity: contact")
-    passing = Counter(one.measures.severity for one in run.cases if not one.failed)
-    for severity, name in (
-        (Severity.CONTACT, CONTACT),
-        (Severity.CONFLICT, "cases with a conflict that are no failures"),
-        (Severity.HARSH, "cases with harsh braking after the merge that are no failures"),
-    ):
-        if passing[severity]:
-            yield Fact(name, passing[severity], f"severity: {severity}, not {failing}")
+    contacts = [one for one in run.cases if one.measures.severity == Severity.CONTACT]
+    if others := sum(not one.failed for one in contacts):
+        yield Fact(CONTACT, others, f"severity: contact, not {failing}")
 
 
-def _of_level(run: RecordedCampaign, level: int, found: LevelSummary, failing: str) -> Facts:
+def _of_level(run: RecordedCampaign, level: int, summary: LevelSummary, failing: str) -> Facts:
     fact = partial(Fact, level=level)
-    yield fact("cases", found.cases, "level")
-    if found.tested < found.cases:
-        yield fact("without a verdict", found.cases - found.tested, "end")
-    if found.tested or not found.cases:
-        yield fact("failures", found.failures, failing)
+    yield fact(CASES, summary.cases, "level")
+    if summary.tested < summary.cases:
+        yield fact("without a verdict", summary.cases - summary.tested, "end")
+    if summary.tested or not summary.cases:
+        yield fact(FAILURES, summary.failures, failing)
         if run.tolerated:
-            yield fact(UNDECIDED, found.undecided, "draw")
-        number = found.failures + found.undecided
-        scattered = number >= 10 and 2 * found.regions > number
-        yield fact("regions", SCATTERED if scattered else found.regions, f"{failing}: starts")
+            yield fact(UNDECIDED, summary.undecided, "draw")
+        number = summary.failures + summary.undecided
+        scattered = number >= 10 and 2 * summary.regions > number
+        yield fact(REGIONS, SCATTERED if scattered else summary.regions, f"{failing}: starts")
         radius = radius_for(len(run.scenario.dimensions(level)))
-        yield fact("FMC", found.fmc, f"{failing}: starts within {radius:.2g}")
+        yield fact(FMC, summary.fmc, f"{failing}: starts within {radius:.2g}")
     if run.scenario.lane_m is None:
         return
     at_level = [outcome for outcome in run.cases if outcome.case.level == level]
@@ -210,7 +224,7 @@ def _repeats(run: RecordedCampaign) -> Facts:
     repeated = [case for case in cases if case.runs > 1]
     if run.tolerated or repeated:
         yield Fact("runs", sum(case.runs for case in cases), "draw")
-        yield Fact("cases that ran more than once", len(repeated), "draw")
+        yield Fact(REPEATED, len(repeated), "draw")
         both = sum(0 < case.failures < case.runs for case in repeated)
         yield Fact("of these, cases that both fail and pass", both, "draw")
     if run.tolerated:
@@ -264,7 +278,10 @@ def _studies(run: RecordedCampaign) -> Facts:
     if known is not None and known.overall is not None and known.is_judged:
         fact = partial(Fact, file=PROBABILITY.name)
         overall, at = known.overall, f"at {known.confidence:.0%}"
-        yield fact(PROBABLY, 100.0 * overall.probability, "overall.probability", PERCENT)
-        yield fact(f"{PROBABLY}, low end {at}", 100.0 * overall.low, "overall.low", PERCENT)
-        yield fact(f"{PROBABLY}, high end {at}", 100.0 * overall.high, "overall.high", PERCENT)
-        yield fact("fresh cases of that", known.cases, "cases")
+        for name, end in (
+            (PROBABILITY_TO_FAIL, "probability"),
+            (f"{PROBABILITY_TO_FAIL}, low end {at}", "low"),
+            (f"{PROBABILITY_TO_FAIL}, high end {at}", "high"),
+        ):
+            yield fact(name, 100.0 * getattr(overall, end), f"overall.{end}", PERCENT)
+        yield fact("fresh cases simulated", known.cases, "cases")

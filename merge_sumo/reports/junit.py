@@ -6,17 +6,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from merge_sumo.analysis.comparison import (
-    GOT_WORSE,
-    Change,
-    Comparison,
-    VersionChange,
-    compare_against,
-)
+from merge_sumo.analysis.comparison import GOT_WORSE, Change, Comparison, VersionChange
+from merge_sumo.campaign_run import CampaignRun
 from merge_sumo.campaigns.recorded import NAME_CHARACTERS, RecordedCampaign
-from merge_sumo.errors import UserError
 from merge_sumo.files import check_new, write_new
-from merge_sumo.metrics.summary import GateResult, Summary, by_case
+from merge_sumo.metrics.summary import by_case
 from merge_sumo.printable import printable
 from merge_sumo.reports.facts import Fact, by_level
 from merge_sumo.reports.pages import environment
@@ -25,9 +19,9 @@ from merge_sumo.scenario.case import described
 from merge_sumo.scenario.scenario import level_name
 
 JUNIT = (".xml",)
-"""Endings of the name of such a file."""
+"""Ending of JUnit files."""
 REGRESSION = "regression"
-"""Type of a case that fails and passes with an earlier version."""
+"""Type of the failure of a case that passes with an earlier version."""
 
 
 @dataclass(slots=True)
@@ -38,8 +32,8 @@ class TestCase:
         name: its name.
         group: last part of its class name.
         time_s: simulated time up to M.
-        tag: failure, error or skipped; "" where it passed.
-        kind: type of the failure or error.
+        tag: failure, error or skipped; empty where it passed.
+        kind: type of the failure or error, such as a severity.
         message: reason of the tag.
     """
 
@@ -51,58 +45,63 @@ class TestCase:
     message: str = ""
 
 
-def check_junit(path: Path, folder: Path) -> None:
-    """Raise `UserError` where a campaign in `folder` cannot write this JUnit file later."""
-    if path.absolute() == folder.absolute():
-        raise UserError(f"`junit` is {path}, the folder of the campaign: choose a file")
+def check_junit(path: Path) -> None:
+    """Check that a campaign can write this JUnit file later.
+
+    Args:
+        path: the file.
+
+    Raises:
+        UserError: it exists, or its name has another ending.
+    """
     check_new(path, "`junit`", JUNIT)
 
 
-def write_junit(
-    path: Path,
-    run: RecordedCampaign,
-    facts: Sequence[Fact],
-    summary: Summary,
-    gates: Sequence[GateResult],
-) -> None:
+def write_junit(path: Path, result: CampaignRun) -> None:
     """Write the JUnit file of a campaign.
 
-    There is a suite of gates, one of the cases that an earlier version also ran, and one of each
-    POV level. A failure and a timeout are a `failure`, whose type is the severity; an error of the
-    VUT or of the simulation is an `error`; an undecided case is `skipped`.
+    It has a suite of gates, a suite of the cases that an earlier version also ran, and a suite of
+    each POV level. A failure or a timeout is a `failure`, whose type is the severity; an error of
+    the VUT or of the simulation is an `error`; an undecided case is `skipped`.
 
     Args:
         path: new file to write.
-        run: the campaign.
-        facts: its facts.
-        summary: its summary.
-        gates: results of its gates.
+        result: the campaign, with its gates.
 
     Raises:
         UserError: the file exists or cannot be written.
     """
+    run, summary = result.recorded, result.summary
     tested = TestCase(f"the VUT reaches {summary.goal}", "gates")
     if not summary.tested:
         tested.tag, tested.kind = "failure", "NOTHING_TESTED"
         tested.message = summary.nothing_tested
     suites = {"gates": [tested]}
-    for gate in gates:
+    for gate in result.gates:
         test = TestCase(gate.name, "gates", kind="GATE", message=gate.sentence)
         test.tag = "failure" if gate.met else ""
         suites["gates"].append(test)
-    compared = compare_against(run)
-    if compared is not None:
+    if result.against is not None:
         earlier = printable(str(run.settings.against)[:NAME_CHARACTERS])
-        suites[f"against {earlier}"] = _tests(compared.version_changes[0])
-    for level in by_level(facts):
+        (version_change,) = result.against.version_changes
+        suites[f"against {earlier}"] = _tests(version_change)
+    for level in by_level(result.facts):
         suites[f"POV level {level_name(level)}"] = []
     for test in _cases(run, summary.undecided_cases):
         suites[f"POV {test.group}"].append(test)
-    _write(path, f"merge-sumo {run.vut}", suites, facts)
+    _write(path, f"merge-sumo {run.vut}", suites, result.facts)
 
 
 def write_junit_of_comparison(path: Path, compared: Comparison) -> None:
-    """Write the JUnit file of a comparison; `UserError` when it exists or cannot be written."""
+    """Write the JUnit file of a comparison.
+
+    Args:
+        path: new file to write.
+        compared: the comparison.
+
+    Raises:
+        UserError: the file exists or cannot be written.
+    """
     suites = {}
     for version_change in compared.version_changes:
         earlier, later = compared.versions[version_change.number - 2 :][:2]
@@ -142,7 +141,7 @@ def _cases(run: RecordedCampaign, undecided: frozenset[int]) -> list[TestCase]:
 
 
 def _tests(version_change: VersionChange, *, every: bool = False) -> list[TestCase]:
-    """Return the cases that changed, or all that two versions ran."""
+    """Return the cases of both versions that changed, or `every` case."""
     tests = []
     if version_change.passes_less:
         test = TestCase("share of cases that pass", "against", 0.0, "failure", REGRESSION)

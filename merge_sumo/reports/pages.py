@@ -1,4 +1,4 @@
-"""Pages from templates: values are escaped, and a policy names the style and script of a page."""
+"""Pages from templates: values are escaped, and a policy allows the style and script of a page."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ if TYPE_CHECKING:
     from jinja2 import Environment
 
 X_AXIS = "x, m (0 at M, negative before it)"
-"""The label of positions over time, in all charts."""
+"""Label of positions over time in all charts."""
 TEMPLATES = Path(__file__).parent / "templates"
 ERROR_CHARACTERS = 2000
-"""Of a message or a setting in a page; the files of the run folder have the whole."""
+"""Longest message or setting in a page; the files of the run folder have the whole."""
 
 
 def page(
@@ -34,6 +34,9 @@ def page(
         styles: names of style sheets to include.
         scripts: names of scripts to include.
         words: variables of the template.
+
+    Example:
+        >>> html = page("reproduce.html.jinja", result=result, table=table, pictures=[])
     """
     own = {}
     for name, files in (("style", styles), ("script", scripts)):
@@ -45,7 +48,11 @@ def page(
 
 
 def source_of(name: str) -> str:
-    """Return a file of the templates' folder."""
+    """Return the text of a file of the templates' folder.
+
+    Args:
+        name: name of the file.
+    """
     return (TEMPLATES / name).read_text(encoding="utf-8")
 
 

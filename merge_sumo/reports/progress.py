@@ -19,8 +19,9 @@ from merge_sumo.printable import counted, printable
 from merge_sumo.reports.report import REPORT
 
 LINES = 10
-"""Lines of a bar without a terminal, where none takes more than `SLOW_S`."""
+"""Lines of a bar without a terminal; there are more where a line would take `SLOW_S`."""
 SLOW_S = 60.0
+"""Maximum time without a line."""
 REDRAWN_S = 0.25
 """Minimum time between two pictures of a bar on a terminal."""
 
@@ -50,7 +51,15 @@ def is_watched() -> bool:
 
 @dataclass(slots=True)
 class _Bar:
-    """A bar: time and count at its first update, and time and count as it was last shown."""
+    """A bar.
+
+    Attributes:
+        start_s: time of its first update.
+        before: count at its first update.
+        shown_s: time at which it was last shown.
+        shown: count that was last shown.
+        task: task of rich; None while nothing is drawn.
+    """
 
     start_s: float
     before: int
@@ -75,7 +84,7 @@ class Bars:
 
         Args:
             console: where to print; by default standard error.
-            shown: whether to show anything; None on a terminal and in a notebook only.
+            shown: whether to show anything; None for only on a terminal and in a notebook.
         """
         self._console = console or Console(stderr=True, force_jupyter=False)
         self._is_shown = is_watched() if shown is None else shown
@@ -127,7 +136,11 @@ class Bars:
         self._progress.update(bar.task, completed=done, note=text)
 
     def say(self, text: str) -> None:
-        """Print a line above the bars."""
+        """Print a line above the bars.
+
+        Args:
+            text: the line.
+        """
         if self._is_shown:
             self._console.print(text, highlight=False, markup=False, soft_wrap=True)
 
@@ -143,24 +156,35 @@ class Bars:
 
 
 class Counter(Bars):
-    """A bar of finished items."""
+    """A bar of finished items; `ended` is a callback of a study."""
 
     def __init__(self, title: str, total: int, unit: str, *, shown: bool | None = True) -> None:
+        """Begin to measure the rate.
+
+        Args:
+            title: title of the bar.
+            total: number of all items.
+            unit: name of the items.
+            shown: whether to show anything; None for only on a terminal and in a notebook.
+        """
         super().__init__(shown=shown)
         self._title, self._total, self._unit = title, total, unit
         self._count = 0
-        self._start_s = time.monotonic()
+        self.ended(0)
 
     def ended(self, count: int, note: str = "") -> None:
-        """Count items that have finished."""
-        if not self._count:
-            self._bars[self._title] = _Bar(self._start_s, 0, self._start_s)
+        """Count items that have finished.
+
+        Args:
+            count: number of further items.
+            note: text after the bar.
+        """
         self._count += count
         self.counted(self._title, self._count, self._total, self._unit, note)
 
 
 class CampaignBars(Bars):
-    """Bars of a campaign and its careful drivers: `ended` is a callback of the campaign."""
+    """Bars of a campaign and of the studies at its end; `ended` is a callback of the campaign."""
 
     def __init__(
         self,
@@ -171,12 +195,21 @@ class CampaignBars(Bars):
         shown: bool | None = True,
         console: Console | None = None,
     ) -> None:
+        """Show nothing yet.
+
+        Args:
+            folder: folder of the campaign.
+            cases: number of all cases.
+            tolerated: share of its runs in which a case may fail.
+            shown: as for `Bars`.
+            console: as for `Bars`.
+        """
         super().__init__(console, shown=shown)
         self._folder, self._cases, self._tolerated = folder, cases, tolerated
         self._outcomes: list[Outcome] = []
 
     def begin(self, title: str, before: Sequence[Outcome] = ()) -> None:
-        """Print the title, and where the report is.
+        """Print the title and the path of the report.
 
         Args:
             title: title of the campaign.
@@ -187,7 +220,11 @@ class CampaignBars(Bars):
         self.ended(before)
 
     def ended(self, outcomes: Sequence[Outcome]) -> None:
-        """Count cases."""
+        """Count cases.
+
+        Args:
+            outcomes: outcomes of cases that have finished.
+        """
         self._outcomes += outcomes
         self.counted("cases", len(self._outcomes), self._cases, "cases", self._found)
 

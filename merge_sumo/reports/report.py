@@ -1,7 +1,7 @@
 """The report of a campaign: one HTML file that needs no network.
 
-Names and messages come from outside: the template escapes them, the JSON holds no "<", the script
-sets text and never markup, and the policy of the page allows that script alone and no loading.
+Names and messages may be hostile: the template escapes them, the JSON has no "<", the script sets
+text and no markup, and the policy of the page allows that script alone and loads nothing.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from merge_sumo.metrics.merge import meanings
 from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.metrics.plausibility import doubts, mostly_clipped
 from merge_sumo.reports.comparison_page import AGAINST_PAGE, write_against
-from merge_sumo.reports.facts import STARTS_THAT_FAIL, by_level
+from merge_sumo.reports.facts import ERRORS, FAILURES, STARTS_THAT_FAIL, TIMEOUTS, by_level
 from merge_sumo.reports.pages import page
 from merge_sumo.reports.report_data import page_data, pairs_of
 from merge_sumo.reports.report_model import ReportModel
@@ -39,17 +39,20 @@ from merge_sumo.reports.text import comparison_headline, headline, robustness
 
 REPORT = "report.html"
 FIRST_S = 2.0
-"""Time after which the report of a running campaign first appears."""
+"""Time after which the report of a running campaign first appears, in s."""
 EVERY_S = 5
 """Minimum time between two reports of a running campaign, in s."""
 MOST_SHARE = 0.1
-"""Maximum share of the time of a campaign that its reports take."""
+"""Maximum share of the time of a campaign for its reports."""
 
 
 def write_report(run: RecordedCampaign) -> Path:
     """Write `report.html` into the folder of a campaign, in place of an older one.
 
     A campaign against an earlier version of the VUT also gets a page of the changes.
+
+    Args:
+        run: the campaign.
 
     Returns:
         The path of the report.
@@ -69,8 +72,8 @@ def _replace(run: RecordedCampaign, html: str) -> None:
 class RunningReport:
     """The report of a running campaign, rewritten every few seconds: a callback of the campaign.
 
-    It has no surrogates, which take seconds to learn. It never stops a campaign: an error appears
-    when the last report is written.
+    It has no surrogates, which take seconds to learn. An error does not stop the campaign; it
+    appears when the last report is written.
 
     Example:
         >>> with RunningReport(folder) as report:
@@ -78,12 +81,21 @@ class RunningReport:
     """
 
     def __init__(self, folder: Path) -> None:
+        """Write nothing yet.
+
+        Args:
+            folder: folder of the campaign.
+        """
         self._folder = folder
         self._due_s = time.monotonic() + FIRST_S
         self._is_there = False
 
     def rewrite(self, _: Sequence[Outcome] = ()) -> None:
-        """Write the report if its time has come."""
+        """Write the report if its time has come.
+
+        Args:
+            _: outcomes that a campaign passes to its callbacks; the report reads the folder.
+        """
         start_s = time.monotonic()
         if start_s < self._due_s or not (self._folder / OUTCOMES).is_file():
             return
@@ -110,17 +122,16 @@ class RunningReport:
 
 
 def check_report(folder: Path) -> None:
-    """Raise `UserError` where merge-sumo did not create the report in a folder."""
+    """Check that the report of a campaign can be replaced.
+
+    Args:
+        folder: folder of the campaign.
+
+    Raises:
+        UserError: merge-sumo did not create the report in it.
+    """
     check_generated(folder / REPORT)
     check_generated(folder / AGAINST_PAGE)
-
-
-LEVEL_ABOUT = {
-    0: "keeps its speed",
-    1: "makes room for a VUT that accelerates",
-    2: "expects a VUT that thinks; psi 0 is egoistic, pi/2 cares for the VUT",
-}
-"""Conduct of the POV of a level, in the words of a caption."""
 
 
 def report_page(run: RecordedCampaign, *, learns: bool = True, running: bool = False) -> str:
@@ -129,9 +140,12 @@ def report_page(run: RecordedCampaign, *, learns: bool = True, running: bool = F
     Args:
         run: the campaign.
         learns: whether the page has surrogates.
-        running: whether the campaign runs: a browser then loads the page again and again.
+        running: whether the campaign runs; a browser then loads the page every few seconds.
+
+    Example:
+        >>> html = report_page(ms.open_run("runs/latest").recorded, learns=False)
     """
-    model, scenario = ReportModel(run, learns=learns), run.scenario
+    model = ReportModel(run, learns=learns)
     warnings = [unrepeatable(read_second_runs(run)), mostly_clipped(run.cases)]
     notes = doubts(run.cases, run.criterion, run.settings.in_vain)
     if run.settings.ran_again:
@@ -146,22 +160,18 @@ def report_page(run: RecordedCampaign, *, learns: bool = True, running: bool = F
         now=f"{datetime.now().astimezone():%H:%M:%S}",
         data=Markup(data),  # noqa: S704 (JSON without "<")
         model=model,
-        run=run,
-        vut=run.vut,
         warnings=filter(None, warnings),
         notes=notes,
         go_on=campaign_command("resume", run.folder, run.record),
         printed=end_of(run.folder / LOG),
-        scenario=scenario,
-        level_about=LEVEL_ABOUT,
-        lane_m=scenario.lane_m,
-        traffic=scenario.vehicles > 2,
         meanings=meanings,
         levels=by_level(model.facts),
         headline=headline(run, model.facts),
         comparison_headline=comparison_headline,
         robustness=robustness,
         starts_that_fail=STARTS_THAT_FAIL,
+        failures=FAILURES,
+        broken=(ERRORS, TIMEOUTS),
         kinds=Counter(model.kinds.values()).most_common(),
         kind_meanings=MEANINGS,
         pairs_of=pairs_of,

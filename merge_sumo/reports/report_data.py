@@ -1,4 +1,4 @@
-"""The data that the script of the report draws from: cases, motion, maps and charts, as JSON."""
+"""The data that the script of the report draws: cases, motion, maps and charts, as JSON."""
 
 from __future__ import annotations
 
@@ -28,15 +28,23 @@ from merge_sumo.scenario.trajectory import Trajectory
 SPEED_UNIT_MPS = 0.002
 """Speeds are whole numbers of this in 16 bits: up to 131 m/s, positions within 2 cm."""
 COUNT_GRID = (32, 20)
+"""Cells of a map, across and up, in which further cases are counted."""
 GRID: dict[int, Grid] = {2: (49, 49, 1), 3: (33, 33, 9)}
-"""Nodes of a map in its two coordinates and in the one that it moves through."""
+"""Nodes of the surrogate by number of coordinates; a map moves through the third one."""
 
 Axes = tuple[int, int]
-"""Places of two coordinates in the pool's order."""
+"""Indices of two coordinates in the pool's order."""
 
 
 def page_data(model: ReportModel) -> dict[str, Any]:
-    """Return the data of a page as JSON has it."""
+    """Return the data of a report as JSON has it.
+
+    Args:
+        model: the content of the report.
+
+    Returns:
+        `cases` has the shown cases as columns; `speeds` is as `packed` returns it.
+    """
     scenario, lane_m = model.run.scenario, model.run.scenario.lane_m
     speeds, offsets = packed(model.motion)
     cause_of = causes(model.run, model.shown)
@@ -51,9 +59,8 @@ def page_data(model: ReportModel) -> dict[str, Any]:
     measures = []
     for name, measure in measures_in(scenario).items():
         if measure.column and any(value is not None for value in cases.get(name, ())):
-            title = f"{scenario.wording(measure.column)} {measure.unit}".replace(
-                "s2", "s²"
-            ).rstrip()
+            unit = measure.unit.replace("s2", "s²")
+            title = f"{scenario.wording(measure.column)} {unit}".rstrip()
             measures.append({"name": name, "title": title, "digits": measure.digits})
     axes = []
     for c in model.coordinates:
@@ -68,7 +75,7 @@ def page_data(model: ReportModel) -> dict[str, Any]:
         "lane": lane_m,
         "place": "M" if lane_m is None else scenario.place,
         "vehicles": VEHICLES[: scenario.vehicles],
-        "level_names": dict(zip(ALL_LEVELS, map(level_name, ALL_LEVELS), strict=True)),
+        "level_names": {level: level_name(level) for level in ALL_LEVELS},
         "coordinates": axes,
         "severities": list(Severity),
         "measures": measures,
@@ -85,9 +92,9 @@ def page_data(model: ReportModel) -> dict[str, Any]:
 
 
 def _row(model: ReportModel, outcome: Outcome) -> dict[str, Any]:
-    """Return a case by column; it has no rows where its motion is not known."""
+    """Return a case by column; it has no rows where its motion is lost."""
     index, measures = outcome.index, outcome.measures
-    motion, course = model.motion.get(index), model.diagnoses.get(index)
+    motion, diagnosis = model.motion.get(index), model.diagnoses.get(index)
     row: dict[str, Any] = {
         "index": index,
         "level": outcome.case.level,
@@ -102,8 +109,8 @@ def _row(model: ReportModel, outcome: Outcome) -> dict[str, Any]:
         "margin": _rounded(outcome.margin, 3),
         "region": model.regions.get(index),
         "last_avoidable_s": measures.last_avoidable_s,
-        "vut_brakes_s": course and course.vut.brakes_s,
-        "pov_brakes_s": course and course.pov.brakes_s,
+        "vut_brakes_s": diagnosis and diagnosis.vut.brakes_s,
+        "pov_brakes_s": diagnosis and diagnosis.pov.brakes_s,
         "kind": model.kinds.get(index),
     }
     for coordinate in model.coordinates:
@@ -164,7 +171,15 @@ def _search(model: ReportModel) -> dict[str, Any]:
 
 
 def packed(motions: dict[int, Trajectory]) -> tuple[str, dict[int, int]]:
-    """Return the speeds of all cars at every step in base64, and the first row of each motion."""
+    """Return the speeds of all cars at every step in base64, and the first row of each motion.
+
+    Args:
+        motions: trajectories by index of the case.
+
+    Returns:
+        Speeds as 16-bit little-endian numbers, row by row, in units of `SPEED_UNIT_MPS`; the first
+        row of each case by its index.
+    """
     first, rows, content = {}, 0, b""
     for index, motion in motions.items():
         speeds = np.rint(np.clip(motion.whole[:, :, 1] / SPEED_UNIT_MPS, 0, 65535))
@@ -175,18 +190,22 @@ def packed(motions: dict[int, Trajectory]) -> tuple[str, dict[int, int]]:
 
 
 def pairs_of(dims: int) -> list[Axes]:
-    """Return the pairs of coordinates of a level that may be shown, the first one first."""
+    """Return the pairs of coordinates of a level that a map may show, the first one first.
+
+    Args:
+        dims: number of coordinates of the level.
+    """
     return [(0, 1)] if dims <= 3 else list(combinations(range(dims), 2))
 
 
 def _map(model: ReportModel, level: int) -> dict[str, Any]:
-    """Return the map of a level: its cases that are counted, and the chance to fail.
+    """Return the map of a level: its cases that are counted, and the failure probability.
 
     A level with two coordinates has one map; with a third, the reader moves through it. With more,
-    a map shows the cases in a pair, without a chance to fail.
+    a map shows the cases in a pair of coordinates, without a failure probability.
     """
     dims, surface = len(model.axes[level]), model.surfaces[level]
-    chance = _chance(surface, GRID[dims]) if surface and dims in GRID else None
+    probability = _probability(surface, GRID[dims]) if surface and dims in GRID else None
     shown = {outcome.index for outcome in model.shown}
     others = [o for o in model.cases if o.case.level == level and o.index not in shown]
     points = to_unit((outcome.case for outcome in others), level, model.run.scenario)
@@ -199,7 +218,7 @@ def _map(model: ReportModel, level: int) -> dict[str, Any]:
             places = points[:, axes]
             counts = {"nx": nx, "ny": ny}
             counts["safe"], counts["failing"] = _counts(places[~failed]), _counts(places[failed])
-        grids.append({"chance": chance, "counts": counts})
+        grids.append({"probability": probability, "counts": counts})
     return {
         "pairs": pairs_of(dims),
         "through": 2 if dims == 3 else None,
@@ -218,8 +237,8 @@ def _counts(places: FloatArray) -> list[int]:
     return counts
 
 
-def _chance(surface: Surface, grid: Grid) -> dict[str, Any]:
-    """Return the chance at the nodes of a map in 255ths."""
+def _probability(surface: Surface, grid: Grid) -> dict[str, Any]:
+    """Return the failure probability at the nodes of a map in 255ths."""
     nx, ny, through = grid
     values = np.rint(255.0 * surface.chance(nodes(grid))).astype(np.uint8)
     data = base64.b64encode(values.tobytes()).decode()

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
-
 from merge_sumo.analysis.comparison import compare_against
 from merge_sumo.analysis.counterfactuals import AVOIDANCE
 from merge_sumo.analysis.explanation import EXPLANATIONS
@@ -40,16 +37,16 @@ class ReportModel:
         cases: the deciding run of each case.
         repeated: by its index, all runs of a case that ran more than once.
         varies: whether runs of a case differ.
-        summary: summary of the campaign.
+        summary: summary of the campaign, with its undecided cases.
         facts: facts of the campaign.
         levels: POV levels.
-        surfaces: surrogate of each level; None where there is none.
+        surfaces: surrogate of each level; None without one.
         coordinates: coordinates of all levels.
         axes: coordinates of each level, in the pool's order.
-        stress: result of the stress test, if there is one.
+        stress: result of the stress test; None without one.
         avoidance: drivers that avoid a failure, by its index.
         explanations: explanations of failures.
-        against: comparison with an earlier version, if there is one.
+        against: comparison with an earlier version; None without one.
         worst: failures, the worst first.
         spread: the listed failures: the worst of each region first.
         near: cases that do not fail, those nearest to a failure first.
@@ -57,13 +54,14 @@ class ReportModel:
         shown: cases that the page holds one by one, in their order.
         regions: region of each failure, by its index.
         motion: trajectories of the shown cases by index; lost ones are missing.
-        diagnoses: conduct of VUT and POV by index, where the motion is there.
+        diagnoses: conduct of VUT and POV by index; lost motions have none.
         kinds: kind of each failure that has one, by its index.
         boxes: boxes of the pool where cases fail, by level.
-        explain: the commands that explain a case and write the report, before and after its index.
+        explain: text of the commands that explain a case and write the report, up to the index of
+            the case, and after it.
 
     Example:
-        >>> model = ReportModel(ms.open_run("runs/latest").run, learns=False)
+        >>> model = ReportModel(ms.open_run("runs/latest").recorded, learns=False)
         >>> model.worst[0].index, model.summary.counts
     """
 
@@ -144,19 +142,3 @@ class ReportModel:
         first += self.spread + self.near[:LISTED] + self.worst + untested + self.near
         by_index = {outcome.index: outcome for outcome in first}
         self.shown = sorted(list(by_index.values())[:SHOWN], key=lambda outcome: outcome.index)
-
-    def settings(self) -> list[tuple[str, Any]]:
-        """Return name and value of each setting, nested ones with their path."""
-        return _flat(self.run.record)
-
-
-def _flat(record: Mapping[str, Any]) -> list[tuple[str, Any]]:
-    rows: list[tuple[str, Any]] = []
-    for name, value in record.items():
-        if isinstance(value, dict):
-            rows += [(f"{name} {inner}", one) for inner, one in _flat(value)]
-        elif isinstance(value, list):
-            rows.append((name, ", ".join(map(str, value))))
-        else:
-            rows.append((name, value))
-    return rows

@@ -1,6 +1,6 @@
-"""Sentences and lines of a terminal about campaigns, cases and studies.
+"""Sentences and lines of a terminal on campaigns, cases and studies.
 
-`lines_of` has a function for each kind of result.
+`lines_of` has a function for each type of result.
 """
 
 from __future__ import annotations
@@ -42,15 +42,20 @@ from merge_sumo.reports.facts import (
     AT_MOST,
     AVOIDED,
     AVOIDED_BY_POV,
+    CASES,
     CONTACT,
     DRIVEN,
+    FAILURES,
+    FMC,
     KIND,
-    PROBABLY,
+    PROBABILITY_TO_FAIL,
+    REGIONS,
     RULE,
     SCATTERED,
     STARTS,
     STARTS_THAT_FAIL,
     UNDECIDED,
+    VUT,
     WORST,
     Fact,
     by_level,
@@ -60,12 +65,23 @@ from merge_sumo.scenario.case import Case, coordinates, described
 from merge_sumo.scenario.scenario import DT_S, US23, VEHICLES, level_name
 from merge_sumo.scenario.trajectory import Trajectory
 
+CHANGES_LISTED = (
+    Change.BROKE,
+    Change.WITHIN_CHANCE,
+    Change.NOT_REPEATABLE,
+    Change.STILL_CONTACT,
+)
+"""Changes whose cases a terminal lists."""
 FRAGILE = 10
-"""Failures that are not robust that a sentence names."""
+"""Maximum number of failures that are not robust in a sentence."""
 
 
 def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
-    """Return the lines of a table with cells to the right; empty columns are left out."""
+    """Return the lines of a table with right-aligned cells; empty columns are left out.
+
+    Args:
+        rows: cells of each row, the same number in each.
+    """
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     lines = []
     for row in rows:
@@ -88,15 +104,20 @@ def cut(number: int, most: int) -> str:
 
 
 def headline(run: RecordedCampaign, facts: Sequence[Fact]) -> list[str]:
-    """Return the first lines about a campaign; their numbers are facts."""
+    """Return the first lines on a campaign, as the terminal and the report begin.
+
+    Args:
+        run: the campaign.
+        facts: its facts, which have all numbers of the lines.
+    """
     of = {fact.name: fact for fact in facts if fact.level is None}
     levels = by_level(facts)
-    cases = _counted(of["cases"], "case")
+    cases = _counted(of[CASES], "case")
     if AT_MOST in of:
-        cases = f"{of['cases'].shown} of {of[AT_MOST].shown} cases, converged"
-    lines = [f"{of['VUT'].shown}: {RULE} {of[RULE].shown}; {cases}"]
+        cases = f"{of[CASES].shown} of {of[AT_MOST].shown} cases, converged"
+    lines = [f"{of[VUT].shown}: {RULE} {of[RULE].shown}; {cases}"]
     rows = []
-    is_measured = PROBABLY in of or SHARES.read(run.folder) is not None
+    is_measured = PROBABILITY_TO_FAIL in of or SHARES.read(run.folder) is not None
     for level, row in levels.items():
         is_measured |= STARTS_THAT_FAIL in row
         rows.append(_level_cells(level, row))
@@ -114,7 +135,7 @@ def headline(run: RecordedCampaign, facts: Sequence[Fact]) -> list[str]:
         lines.append("; ".join(remarks))
 
     if AVOIDED_BY_POV in of:
-        number = _counted(of["failures"], "failure")
+        number = _counted(of[FAILURES], "failure")
         if DRIVEN in of:
             number = f"{of[DRIVEN].shown} of {number}"
         drivers = [f"{name} {of[AVOIDED.format(name)].shown}" for name in REFERENCE_DRIVERS]
@@ -135,15 +156,15 @@ def _level_cells(level: int, of: Mapping[str, Fact]) -> list[str]:
     cells = [f"level {level_name(level)}", "", "nothing tested", "", ""]
     if STARTS_THAT_FAIL in of:
         cells[1] = f"{of[STARTS_THAT_FAIL].shown} of all starts fail, by {of[STARTS].shown}"
-    if "failures" in of:
-        cells[2] = f"{_counted(of['failures'], 'failure')} found"
+    if FAILURES in of:
+        cells[2] = f"{_counted(of[FAILURES], 'failure')} found"
         if UNDECIDED in of and of[UNDECIDED].value:
             cells[2] += f", {of[UNDECIDED].shown} undecided"
-        if of["FMC"].value:
-            regions = of["regions"]
+        if of[FMC].value:
+            regions = of[REGIONS]
             is_number = regions.value != SCATTERED
             cells[3] = _counted(regions, "region") if is_number else SCATTERED
-            cells[4] = f"FMC {of['FMC'].shown}"
+            cells[4] = f"FMC {of[FMC].shown}"
     return cells
 
 
@@ -151,7 +172,11 @@ def _level_cells(level: int, of: Mapping[str, Fact]) -> list[str]:
 
 
 def change_in_words(case: ComparedCase) -> str:
-    """Return both outcomes of a case in words, with the runs of each where there are several."""
+    """Return both outcomes of a case in words, with the runs of each where there are several.
+
+    Args:
+        case: the case of both versions.
+    """
     if case.p_value is not None and case.earlier_runs is not None and case.later_runs is not None:
         shares = f"{case.earlier_runs.in_words} -> {case.later_runs.in_words}"
         return f"{shares}, by Fisher's exact test p = {case.p_value:.2g}"
@@ -166,13 +191,15 @@ def change_in_words(case: ComparedCase) -> str:
 
 
 def version_change_headline(version_change: VersionChange) -> str:
-    """Return the numbers of a change of version in a sentence: cases by their change."""
-    parts = []
+    """Return the numbers of a change of version in a sentence: cases by their change.
+
+    Args:
+        version_change: the change of version.
+    """
+    parts, later = [], version_change.number
     if version_change.passes_less:
         by = f"by Fisher's exact test p = {version_change.p_value:.2g}"
-        parts.append(
-            f"{version_change.number} passes less often than {version_change.number - 1}, {by}"
-        )
+        parts.append(f"{later} passes less often than {later - 1}, {by}")
     if version_change.cases:
         numbers = []
         for change in Change:
@@ -185,20 +212,26 @@ def version_change_headline(version_change: VersionChange) -> str:
 
 
 def comparison_headline(compared: Comparison) -> str:
-    """Return the failures of each version, and how much broke and was fixed, in a sentence."""
+    """Return the failures of each version, and the cases by their change, in a sentence.
+
+    Args:
+        compared: the comparison.
+    """
     parts = [" -> ".join(version.summary.counts for version in compared.versions)]
     for version_change in compared.version_changes:
-        between = (
-            f"from {version_change.number - 1} to {version_change.number}: "
-            if len(compared.version_changes) > 1
-            else ""
-        )
-        parts.append(between + version_change_headline(version_change))
+        text = version_change_headline(version_change)
+        if len(compared.version_changes) > 1:
+            text = f"from {version_change.number - 1} to {version_change.number}: {text}"
+        parts.append(text)
     return "; ".join(parts)
 
 
 def fmc_rows(compared: Comparison) -> dict[int, list[str]]:
-    """Return by level the FMC of each version as text, of its own cases; "-" for none."""
+    """Return the FMC of the cases of each version as text, by level; "-" for no tested case.
+
+    Args:
+        compared: the comparison.
+    """
     rows: dict[int, list[str]] = {}
     for number, version in enumerate(compared.versions):
         for level, summary in version.summary.levels.items():
@@ -210,7 +243,11 @@ def fmc_rows(compared: Comparison) -> dict[int, list[str]]:
 
 @lines_of.register
 def comparison(compared: Comparison) -> list[str]:
-    """Return the numbers, of each version and of each change, and the first of the cases."""
+    """Return the numbers of each version and each change, and the first of the cases.
+
+    Args:
+        compared: the comparison.
+    """
     text = [comparison_headline(compared)]
     if compared.text is not None:
         return [*text, *compared.notes]
@@ -223,42 +260,43 @@ def comparison(compared: Comparison) -> list[str]:
             text.append(f"  {late}")
     for level, row in fmc_rows(compared).items():
         text.append(f"level {level_name(level)}: FMC {' -> '.join(row)}")
-    differ = False
     for version_change in compared.version_changes:
-        text += _version_change_lines(version_change)
-        differ |= version_change.count(Change.BOTH) < len(version_change.cases)
-    if differ and compared.page_command:
+        later, cases = version_change.number, version_change.cases
+        if cases:
+            text.append(f"from {later - 1} to {later}: {counted(len(cases), 'case')} with both")
+        text += transitions(version_change)
+        for change in CHANGES_LISTED:
+            changed = [case for case in cases if case.change is change]
+            if changed:
+                text.append(f"{change}{cut(len(changed), LISTED)}:")
+            for case in changed[:LISTED]:
+                text.append(f"  case {case.later.index}: {change_in_words(case)}")
+    if compared.page_command:
         text.append(f"both motions in one picture: {compared.page_command}")
     return [*text, *compared.notes]
 
 
 def transitions(version_change: VersionChange) -> list[str]:
-    """Return the number of cases of each change as lines."""
+    """Return a line with the number of cases for each change.
+
+    Args:
+        version_change: the change of version.
+    """
     lines = []
-    for (change, before, after), number in version_change.transitions.items():
-        lines.append(f"{number:8d}  {before} -> {after} ({change})")
+    for (change, earlier, later), number in version_change.transitions.items():
+        lines.append(f"{number:8d}  {earlier} -> {later} ({change})")
     return lines
-
-
-def _version_change_lines(version_change: VersionChange) -> Iterator[str]:
-    if version_change.cases:
-        cases = counted(len(version_change.cases), "case")
-        yield f"from {version_change.number - 1} to {version_change.number}: {cases} with both"
-    yield from transitions(version_change)
-    listed = (Change.BROKE, Change.WITHIN_CHANCE, Change.NOT_REPEATABLE, Change.STILL_CONTACT)
-    for change in listed:
-        changed = [case for case in version_change.cases if case.change is change]
-        if changed:
-            yield f"{change}{cut(len(changed), LISTED)}:"
-        for case in changed[:LISTED]:
-            yield f"  case {case.later.index}: {change_in_words(case)}"
 
 
 # Truths and samplers
 
 
 def truth_remarks(truth: Truth) -> list[str]:
-    """Return the quantities for which a truth has too few cases, in clauses."""
+    """Return the quantities for which a truth has too few cases, in clauses.
+
+    Args:
+        truth: the truth of a level.
+    """
     remarks = []
     if truth.is_small:
         remarks.append(
@@ -276,7 +314,11 @@ def truth_remarks(truth: Truth) -> list[str]:
 
 @lines_of.register
 def truths(found: TruthResult) -> list[str]:
-    """Return a line for each level, and the criterion."""
+    """Return a line for each level, and the criterion.
+
+    Args:
+        found: the truths.
+    """
     lines = []
     for level, truth in found.truths.items():
         line = (
@@ -308,7 +350,11 @@ def _cell(value: float | None, form: str) -> str:
 
 @lines_of.register
 def samplers(study: SamplerStudy) -> list[str]:
-    """Return truth and limit, and a table of the samplers: medians [quartiles]."""
+    """Return truth and limit, and a table of the samplers: medians [quartiles].
+
+    Args:
+        study: the study.
+    """
     failures = sum(len(truth.failures) for truth in study.truths.values())
     line = f"truth: FMC {study.truth_fmc:.4f}, {counted(failures, 'failure')}"
     if study.regions is not None:
@@ -322,17 +368,20 @@ def samplers(study: SamplerStudy) -> list[str]:
         line += f", or of {DENSE_CASES:,} uniform cases, where that is more"
     lines.append(line)
 
-    head = ["covered share", "FMC", "failures", "regions", "to 90 %"]
-    # Nothing is divided by a truth that is too small.
-    over = [] if study.is_small else ["FMC / truth", "FMC / limit"]
-    rows = [["sampler", *over, *head]]
+    head = ["sampler", "FMC / truth", "FMC / limit", "covered share", "FMC", "failures", "regions"]
+    rows = [[*head, "to 90 %"]]
     for name, one in study.samplers.items():
-        row = [name]
-        if over:
-            row += [_spread(one.fmc_over_truth, ".3f"), _spread(one.fmc_over_limit, ".3f")]
-        row += [_spread(one.covered_share, ".3f"), _spread(one.fmc, ".4f")]
-        row += [_spread(one.failures, ".0f"), _spread(one.regions_found, ".1f")]
-        rows.append([*row, _spread(one.cases_to_90_percent, ".0f")])
+        row = [
+            name,
+            _spread(one.fmc_over_truth, ".3f"),
+            _spread(one.fmc_over_limit, ".3f"),
+            _spread(one.covered_share, ".3f"),
+            _spread(one.fmc, ".4f"),
+            _spread(one.failures, ".0f"),
+            _spread(one.regions_found, ".1f"),
+            _spread(one.cases_to_90_percent, ".0f"),
+        ]
+        rows.append(row)
     lines += [*aligned(rows), "medians [quartiles]"]
     if probes := sum(map(len, study.probes.values())):
         lines.append(f"covered share: of {counted(probes, 'failing uniform case')}")
@@ -341,7 +390,11 @@ def samplers(study: SamplerStudy) -> list[str]:
 
 @lines_of.register
 def reproduction(found: Reproduction) -> list[str]:
-    """Return Table II as Markdown: our medians, with the paper's numbers in brackets."""
+    """Return Table II as Markdown: our medians, with the paper's numbers in brackets.
+
+    Args:
+        found: the reproduction.
+    """
     rows = [
         f"| FMC: ours (the paper's) | {' | '.join(found.columns)} |",
         "|---|" + "---|" * len(found.columns),
@@ -355,21 +408,23 @@ def reproduction(found: Reproduction) -> list[str]:
 
 
 def table_ii(found: Reproduction) -> Iterator[tuple[str, list[str]]]:
-    """Yield the rows of Table II: a name, and a cell for each column."""
-    ours = [_fmc_of(one.study) for one in found.columns.values()]
-    papers = []
+    """Yield the rows of Table II: a name, and a cell for each column.
+
+    Args:
+        found: the reproduction.
+    """
+    rows: dict[str, list[str]] = {}
     for one in found.columns.values():
         paper = dict(one.column.paper)
         for name in ADAPTIVE:
             if name in paper:
                 paper[f"{name} / truth"] = paper[name] / paper["truth"]
-        papers.append(paper)
-    for name in ours[0]:
-        form = ".2f" if "/" in name else ".4f"
-        cells = []
-        for own, paper in zip(ours, papers, strict=True):
-            cell = _cell(own[name], form)
-            cells.append(f"{cell} ({paper[name]:{form}})" if name in paper else cell)
+        for name, value in _fmc_of(one.study).items():
+            form = ".2f" if "/" in name else ".4f"
+            cell = _cell(value, form)
+            cell += f" ({paper[name]:{form}})" if name in paper else ""
+            rows.setdefault(name, []).append(cell)
+    for name, cells in rows.items():
         if set(cells) != {"-"}:
             yield name, cells
 
@@ -400,7 +455,11 @@ def _fmc_of(study: SamplerStudy) -> dict[str, float | None]:
 
 @lines_of.register
 def probability(found: ProbabilityResult) -> list[str]:
-    """Return the probability and its interval, the strata, the levels, and the counted cases."""
+    """Return the probability and its interval, the strata, the levels, and the counted cases.
+
+    Args:
+        found: the probability.
+    """
     if not found.is_judged:
         return ["P(fail) is not known: no case was judged, the VUT never reached the merge point"]
     at = f"{100.0 * found.confidence:g} % interval"
@@ -447,7 +506,11 @@ def _per_merge(one: PerMerge, at: str) -> list[str]:
 
 @lines_of.register
 def stress(found: StressResult) -> list[str]:
-    """Return a table of the rungs, and which failures are robust."""
+    """Return a table of the rungs, and the robust failures.
+
+    Args:
+        found: the stress test.
+    """
     lines = [
         f"{counted(found.cases, 'case')} of {found.vut}, {len(found.failures)} of them "
         f"failures, {found.runs} times each",
@@ -465,7 +528,11 @@ def stress(found: StressResult) -> list[str]:
 
 
 def robustness(found: StressResult) -> str:
-    """Return how many failures are robust, and which others pass most often."""
+    """Return the number of robust failures, and the others that pass most often.
+
+    Args:
+        found: the stress test.
+    """
     if not found.failures:
         return "no case failed: which passes fail on a rung is in the table"
     failures = counted(len(found.failures), "failure")
@@ -483,7 +550,11 @@ def robustness(found: StressResult) -> str:
 
 @lines_of.register
 def explanation(result: ExplanationResult) -> list[str]:
-    """Return the failure, its cause, its changes, and a command that runs the smallest."""
+    """Return the failure, its cause, its changes, and a command that runs the smallest change.
+
+    Args:
+        result: the explanation.
+    """
     run, found = result.run, result.found
     outcome = run.outcome(found.index)
     level = level_name(outcome.case.level)
@@ -505,7 +576,12 @@ def explanation(result: ExplanationResult) -> list[str]:
 
 
 def changes(found: Explanation, case: Case) -> Iterator[str]:
-    """Yield the changes of a failure with which it passes: along axes, and at other levels."""
+    """Yield the changes with which a failure passes: along axes, and at other levels.
+
+    Args:
+        found: the explanation.
+        case: the failing case.
+    """
     for axis in found.start:
         yield _axis(axis, *name_and_unit(case, axis.name))
     for axis in found.parameters:
@@ -517,7 +593,12 @@ def changes(found: Explanation, case: Case) -> Iterator[str]:
 
 
 def name_and_unit(case: Case, field: str) -> tuple[str, str]:
-    """Return name and unit of a coordinate; of an unknown one its field."""
+    """Return name and unit of a coordinate.
+
+    Args:
+        case: a case that has it.
+        field: its field of `Case`; an unknown one is its own name.
+    """
     for coordinate in coordinates(case.scenario, (case.level,)):
         if coordinate.field == field:
             return coordinate.name, coordinate.unit
@@ -533,7 +614,11 @@ def _axis(axis: Axis, name: str, unit: str) -> str:
 
 @lines_of.register
 def vut_check(found: VutCheck) -> list[str]:
-    """Return the problems in sentences, and the cost of a step."""
+    """Return the problems in sentences, and the cost of a step.
+
+    Args:
+        found: the check.
+    """
     lines = list(found.problems) or ["nothing wrong"]
     for sentence in found.notes:
         lines.append(f"note: {sentence}")

@@ -73,6 +73,6 @@ def test_a_text_of_another_user_stays_a_text(call, name, honest, tmp_path):
     assert len(written) == 2, "as recorded, and with a free ego"
     assert {etree.parse(file).getroot().tag for file in written} == {"OpenSCENARIO"}
     opened = open_run(folder)
-    write_junit(tmp_path / "junit.xml", opened.recorded, opened.facts, opened.summary, [])
+    write_junit(tmp_path / "junit.xml", opened)
     assert etree.parse(tmp_path / "junit.xml").getroot().tag == "testsuites"
     assert "<script" not in opened._repr_html_() + opened.errors._repr_html_()

@@ -16,6 +16,7 @@ from support.campaigning import campaign_settings, run_campaign
 from support.handmade import write_run
 
 import merge_sumo as ms
+from merge_sumo.campaign_run import CampaignRun
 from merge_sumo.campaigns.recorded import RecordedCampaign, failures
 from merge_sumo.errors import UserError
 from merge_sumo.metrics.summary import Gate, LevelSummary, parse_gates, summarise
@@ -81,12 +82,6 @@ class TestAGate:
         found = Gate("fmc", 0.05).check(replace(summarise([]), levels={0: one, 1: other}))
         assert found.sentence == f"gate fmc>0.05: {verb} (FMC {fmc:.4f} at level 1)"
 
-    def test_on_cases_is_met_by_one_of_them(self, tmp_path):
-        run = write_run(tmp_path / "run", 20, levels=(0,), errors={0: "x"}, timeouts=(1,))
-        for name in ("failures", "errors", "timeouts"):
-            assert Gate(name).check(summarise(run.outcomes)).met
-            assert not Gate(name).check(summarise([])).met
-
 
 def read_junit(file: Path) -> etree._Element:
     root = etree.parse(file).getroot()
@@ -103,10 +98,8 @@ def written(tmp_path_factory) -> RecordedCampaign:
 
 @pytest.fixture(scope="module")
 def root(written) -> etree._Element:
-    opened = ms.open_run(written.folder)
-    gates = [Gate(name).check(opened.summary) for name in ("errors", "fmc")]
     path = written.folder.with_name("junit.xml")
-    write_junit(path, written, opened.facts, opened.summary, gates)
+    write_junit(path, CampaignRun(written, gates=("errors", "fmc>0")))
     return read_junit(path)
 
 
@@ -115,9 +108,6 @@ class TestJUnit:
         assert [suite.get("name") for suite in root] == ["gates", "POV level 0", "POV level 2"]
         names = root.xpath("//testcase/@name")
         assert len(set(names)) == len(names) == 3 + 40
-        for suite, level in zip(root[1:], (0, 2), strict=True):
-            at_level = [o.measures for o in written.outcomes if o.case.level == level]
-            assert float(suite.get("time")) == pytest.approx(sum(o.t_end_s for o in at_level))
         assert (root.get("errors"), root[1].get("errors"), root[2].get("errors")) == ("1", "0", "1")
         failed = summarise(written.outcomes).failures
         assert root.get("failures") == str(failed + 2 + 2), "with 2 timeouts and 2 gates"
@@ -131,8 +121,7 @@ class TestJUnit:
 
     def test_fails_where_nothing_was_tested(self, tmp_path):
         run = write_run(tmp_path / "run", 4, levels=(0,), timeouts=range(4))
-        facts = ms.open_run(run.folder).facts
-        write_junit(tmp_path / "junit.xml", run, facts, summarise(run.outcomes), [])
+        write_junit(tmp_path / "junit.xml", CampaignRun(run))
         failure, *_ = read_junit(tmp_path / "junit.xml").iter("failure")
         assert failure.text.startswith("nothing was tested")
 
@@ -154,7 +143,7 @@ def test_an_undecided_case_is_skipped_in_junit(tmp_path):
     opened = ms.open_run(run_campaign(settings, tmp_path / "run").folder)
     number = opened.summary.undecided
     assert number == len(failures(opened.recorded.outcomes)) > 0, "each case ran once"
-    write_junit(tmp_path / "junit.xml", opened.recorded, opened.facts, opened.summary, [])
+    write_junit(tmp_path / "junit.xml", opened)
     root = read_junit(tmp_path / "junit.xml")
     assert (root.get("failures"), root[1].get("skipped")) == ("0", str(number))
     assert all(one.get("message").startswith("undecided: ") for one in root.iter("skipped"))

@@ -103,9 +103,6 @@ class TestWhichVehicleBrakes:
 
 
 class TestTheKind:
-    def test_is_a_squeeze_where_neither_does(self):
-        assert diagnosed(meeting(KEEP, LEVEL0)).kind is Kind.SQUEEZE
-
     def test_is_none_where_the_cars_are_6_m_apart(self):
         assert diagnosed(meeting(BRAKES, COASTS, gap_m=30.0)).kind is None
 

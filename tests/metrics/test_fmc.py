@@ -75,19 +75,9 @@ def test_the_radius_keeps_the_volume_of_the_disc_of_three_dimensions():
     assert [round(radius_for(d), 3) for d in (3, 4, 5, 6)] == [0.05, 0.123, 0.2, 0.272]
 
 
-def test_the_hole_of_a_ring_does_not_count():
-    count, ring = 24, 0.3
-    angles = 2 * math.pi * np.arange(count) / count
-    points = 0.5 + ring * np.column_stack([np.cos(angles), np.sin(angles)])
-    step = 2 * ring * math.sin(math.pi / count)
-    assert step < 2 * RADIUS  # closed, so there is a hole
-    assert fmc(points) == pytest.approx(count * (DISC - common(step, 2)), rel=1e-12)
-
-
 @pytest.mark.parametrize("dimension", [2, 3])
-@pytest.mark.parametrize(("count", "width"), [(2000, 1.0)])
-def test_monte_carlo_of_the_definition(dimension, count, width):
-    points = np.random.default_rng(count + dimension).random((count, dimension)) * width
+def test_monte_carlo_of_the_definition(dimension):
+    points = np.random.default_rng(dimension).random((2000, dimension))
     expected, its_error = monte_carlo(points, 7, radius_for(dimension))
     error = 2e-3 * expected if dimension > 2 else 0.0
     assert its_error < 0.02 * expected
@@ -106,9 +96,9 @@ coordinates = st.one_of(
 
 
 @st.composite
-def point_sets(draw, dimensions, most=12):
+def point_sets(draw, dimensions):
     d = draw(st.sampled_from(dimensions))
-    count = draw(st.integers(1, most))
+    count = draw(st.integers(1, 12))
     return draw(arrays(np.float64, (count, d), elements=coordinates))
 
 
@@ -151,20 +141,6 @@ class TestRegions:
         assert not (np.diff(axis) <= 0.05).all()  # rounding
         assert set(regions(axis[:, None])) == {0}
         assert regions([[0.0], [0.0501]]).tolist() == [0, 1]
-
-    @examples
-    @given(point_sets(range(1, 7), most=25))
-    def test_against_walking_the_graph(self, points):
-        distance = np.linalg.norm(points[:, None] - points[None], axis=2)
-        reach = distance <= radius_for(points.shape[1]) * (1 + 1e-9)
-        for _ in range(5):  # paths of up to 32 links
-            reach = reach @ reach
-        labels = regions(points)
-        assert ((labels[:, None] == labels[None]) == reach).all()
-        sizes = np.bincount(labels)
-        firsts = [int(np.flatnonzero(labels == label)[0]) for label in range(len(sizes))]
-        order = list(zip(-sizes, firsts, strict=True))
-        assert order == sorted(order)
 
 
 def test_the_balls_around_failures_cover_places_within_the_radius_inclusively():

@@ -5,8 +5,6 @@
 from __future__ import annotations
 
 import math
-import subprocess
-import sys
 import warnings
 
 import numpy as np
@@ -145,10 +143,3 @@ def test_a_cases_file_of_more_says_how_many_it_has(tmp_path):
         ms.export(run.folder, file_format="cases", out=tmp_path / "cases.toml")
     with pytest.raises(UserError, match=r"end it in \.csv"):
         ms.export(run.folder, file_format="csv", out=tmp_path / "table.txt")
-
-
-def test_no_export_loads_libsumo():
-    script = "import sys, merge_sumo.reports.exports; print('libsumo' in sys.modules)"
-    command = [sys.executable, "-c", script]
-    done = subprocess.run(command, capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "False"

@@ -101,29 +101,6 @@ def test_are_all_in_the_report_and_in_its_json(made, facts, page):
     assert [Fact(**row) for row in said["facts"]] == list(facts.values())
 
 
-def test_of_the_headline_are_all_its_numbers_and_words(made, facts):
-    of = {name: fact.shown for (name, level), fact in facts.items() if level is None}
-    first, *levels, unknown, avoided, worst = headline(made, CampaignRun(made).facts)
-    rule = "front bumpers are within 6 m when the VUT reaches the merge point"
-    assert first == f"handmade: a case fails when {rule}; 180 cases"
-    for level, line in enumerate(levels):
-        regions = facts["regions", level].shown
-        if regions != "scattered":
-            regions += " region" if regions == "1" else " regions"
-        found = f"{facts['failures', level].shown} failures found"
-        fmc = facts["FMC", level].shown
-        assert " ".join(line.split()) == f"level {level} {found} {regions} FMC {fmc}"
-    measure = f"merge-sumo probability {made.folder} --vut handmade"
-    assert unknown == f"starts that fail are not measured: {measure}"
-    assert avoided == (
-        f"avoided of {of['failures']} failures: by driver careful 1, fsm 0, reg157 0, rss 1, "
-        "by a careful POV 1"
-    )
-    command = f"merge-sumo replay {made.folder} {of['worst case']} --gui"
-    assert worst == f"worst case ({of['kind of the worst case']}): {command}"
-    assert "contact at a relative speed of " in of["kind of the worst case"]
-
-
 def test_of_the_headline_begin_terminal_and_report(made, page):
     lines = headline(made, CampaignRun(made).facts)
     printed = CampaignRun(made).lines()

@@ -6,7 +6,6 @@ the measures. An unknown sentence fails the test.
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -24,10 +23,8 @@ from merge_sumo.metrics.cause import cause
 from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.reports.comparison_page import comparison_page
 from merge_sumo.reports.junit import write_junit
-from merge_sumo.reports.report_model import ReportModel
 from merge_sumo.reports.text import causes
 from merge_sumo.road.scenario_file import named_scenario
-from merge_sumo.scenario.case import Case
 from merge_sumo.scenario.scenario import US23
 from merge_sumo.scenario.trajectory import End, Trajectory
 
@@ -123,12 +120,6 @@ class Motion:
         return False
 
 
-COORDINATES: dict[str, Callable[[Case], float | None]] = {
-    "x_POV0": lambda case: case.x_pov0_m,
-    "v_POV0": lambda case: case.v_pov0_mps,
-    "psi": lambda case: case.svo_rad,
-    "POV due": lambda case: -case.x_pov0_m / case.v_pov0_mps,
-}
 KINDS: dict[str, Callable[[float | None, float | None, float], bool]] = {
     "stalemate": lambda vut, pov, out: vut is not None and vut <= out and pov is not None,
     "squeeze": lambda vut, pov, _: vut is None and pov is None,
@@ -232,11 +223,7 @@ class TestTheCause:
             if outcome.measures.end.is_error:
                 assert text.startswith(f"{outcome.measures.end} at ")
                 continue
-            check_cause(text, outcome, motion := Motion(campaign.trajectory(index)))
-            slows_mps = outcome.measures.pov_slowdown_mps or 0.0
-            brakes_mps2 = outcome.measures.pov_sustained_brake_mps2 or 0.0
-            assert (slows_mps >= BRAKED_MPS - 1e-6) == (motion.braking_s(motion.pov) is not None)
-            assert slows_mps >= 1.6 * brakes_mps2 - 1e-6
+            check_cause(text, outcome, Motion(campaign.trajectory(index)))
 
     def test_is_said_first_wherever_the_case_is_shown(self, campaign_of, tmp_path):
         run = campaign_of("design1")
@@ -245,24 +232,9 @@ class TestTheCause:
         assert ms.run(recorded=(run.folder, index)).lines()[1] == said
         assert ms.replay(run.folder, index).lines()[1] == said
         assert ms.explain(run.folder, index).lines()[1].strip() == said
-        opened = ms.open_run(run.folder)
-        write_junit(tmp_path / "junit.xml", run, opened.facts, opened.summary, [])
+        write_junit(tmp_path / "junit.xml", ms.open_run(run.folder))
         assert said in [one.text for one in etree.parse(tmp_path / "junit.xml").iter("failure")]
         compared = ms.compare([run.folder, run.folder])
         without = cause(outcome, run.trajectory(index))
         assert said.startswith(without.removesuffix("."))
         assert comparison_page(compared).count(f": {without}</p>") == 2
-
-
-def test_regions_in_words_hold_the_cases_that_they_count(campaign):
-    names = "|".join(COORDINATES)
-    bound = re.compile(rf"({names})\D* (between|above|below) {NUMBER}(?: and {NUMBER})?")
-    for box in ReportModel(campaign, learns=False).boxes:
-        inside = [o for o in campaign.outcomes if o.case.level == box.level]
-        for name, kind, *numbers in bound.findall(box.where):
-            ends = [float(number) for number in numbers if number]
-            low = -math.inf if kind == "below" else ends[0]
-            high = math.inf if kind == "above" else ends[-1]
-            inside = [o for o in inside if low <= (COORDINATES[name](o.case) or 0.0) <= high]
-        failing = [o for o in inside if abs(o.measures.dx_m or NEAR_M) < NEAR_M]
-        assert (len(failing), len(inside)) == (box.failures, box.cases), box.where

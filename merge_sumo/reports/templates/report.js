@@ -47,7 +47,7 @@ function words(i) {
   return [cases.cause[i], margin, runsInWords(i)].filter(Boolean).join(" ");
 }
 
-/* ---------- grids: the surrogate's chance ---------- */
+/* ---------- grids: the surrogate's failure probability ---------- */
 function slice(grid, at) { // `at` a share of the third coordinate; null for all of it at once
   if (!grid.values) grid.values = bytes(grid.data);
   const { nx, ny, np, values } = grid, size = nx * ny;
@@ -106,15 +106,15 @@ function FailureMap(figure) {
   };
   this.level = level;
   this.draw = () => {
-    const { chance } = of.grids[pair], share = all ? null : unit(third, at);
+    const { probability } = of.grids[pair], share = all ? null : unit(third, at);
     svg.replaceChildren();
     const clip = draw(draw(svg, "defs"), "clipPath", { id: "clip" });
     draw(clip, "rect", { x: left, y: top, width, height });
-    if (chance && data.varies) { // further from cases that ran more than once the surrogate says too much
+    if (probability && data.varies) { // further from cases that ran more than once the surrogate says too much
       const known = draw(clip.parentNode, "clipPath", { id: `known${level}`, "clip-path": "url(#clip)" });
       for (const mark of marks) if (runsOf(mark.i)) ball(known, mark, of.radius / 2);
     }
-    if (chance) shade(svg, slice(chance, share), chance.nx, chance.ny, BOX, data.varies ? `known${level}` : "clip");
+    if (probability) shade(svg, slice(probability, share), probability.nx, probability.ny, BOX, data.varies ? `known${level}` : "clip");
     for (const [n, c] of axes.entries()) {
       const vertical = n === 0, span = c.high - c.low;
       const step = ticks(span / (vertical ? 4 : 5));
