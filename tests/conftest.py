@@ -27,7 +27,7 @@ MOUNT, UMOUNT = shutil.which("mount"), shutil.which("umount")
 
 
 def pytest_configure() -> None:
-    """Let linear algebra have one thread in each process: several are as many as the cores."""
+    """Let linear algebra have one thread in each process: tests run on all cores."""
     for library in ("OMP", "OPENBLAS", "MKL"):  # of those that are loaded later, and of children
         os.environ.setdefault(f"{library}_NUM_THREADS", "1")
     threadpool_limits(1)
@@ -35,7 +35,7 @@ def pytest_configure() -> None:
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_auto_num_workers(config: pytest.Config) -> int | None:
-    """Run in this process alone where somebody reads along, or only a few files are wanted."""
+    """Run in this process where output is not captured, or only files are named."""
     alone = config.option.capture == "no" or all(".py" in name for name in config.args)
     return 0 if alone else None
 
@@ -153,11 +153,11 @@ def small_disk(tmp_path):
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_call(item: pytest.Item):
-    """Measure coverage behind a test in which an exception of a signal has ended the tracer."""
+    """Continue to measure coverage after a test in which a signal has ended the tracer."""
     tracer = sys.gettrace()
     yield
     if tracer is not None and sys.gettrace() is None:
-        item.warn(pytest.PytestWarning("the tracer of coverage had ended and goes on"))
+        item.warn(pytest.PytestWarning("the tracer of coverage had ended and was set again"))
         sys.settrace(tracer)
 
 

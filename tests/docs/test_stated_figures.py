@@ -1,6 +1,6 @@
 """Figures that pages state of the shipped drivers, recomputed where that takes seconds.
 
-Beside a figure that takes longer stands the command that prints it.
+Pages give the command that prints a figure that takes longer.
 """
 
 # mypy: no-strict-optional
@@ -67,19 +67,19 @@ class TestTruths:
     @pytest.mark.parametrize(("level", "cases"), [(0, 10_000), (1, 10_000), (2, 20_000)])
     def test_of_the_drivers_of_people(self, vut, level, cases):
         (row,) = re.findall(rf"^\| {vut}, level {level} \| (.*)$", page(HUMAN), re.MULTILINE)
-        told = [cell.strip() for cell in row.split("|")]
+        stated = [cell.strip() for cell in row.split("|")]
         for at, settings in ((0, {}), (3, {"policies": "human"})):
             failures, fmc, sizes = figures(vut, level, cases, **settings)
-            assert told[at : at + 2] == [str(failures), fmc]
-            assert told[at + 2] in ("", str(len(sizes)))
+            assert stated[at : at + 2] == [str(failures), fmc]
+            assert stated[at + 2] in ("", str(len(sizes)))
 
     @pytest.mark.parametrize(("level", "cases"), [(0, 10_000), (1, 10_000), (2, 20_000)])
     def test_of_the_roundabout(self, level, cases):
         failures, fmc, sizes = figures("roundabout", level, cases, scenario="roundabout")
         row = f"| level {level} | {cases:,} | {failures} | {fmc} | {len(sizes)} |"
         assert row in page(ROUNDABOUT)
-        said = ("none of 10,000 uniform", f"{failures}, all", f"{failures} of 20,000")[level]
-        assert f"at level {level} in {said}" in page("docs/explanations/scenarios.md")
+        share = ("none of 10,000 uniform", f"{failures}, all", f"{failures} of 20,000")[level]
+        assert f"at level {level} in {share}" in page("docs/explanations/scenarios.md")
 
 
 @pytest.mark.parametrize("library", LIBRARIES, ids=["default", "human", "roundabout"])

@@ -39,7 +39,7 @@ def browser():
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory) -> RecordedCampaign:
-    run = write_run(tmp_path_factory.mktemp("browser") / "run", error=None)
+    run = write_run(tmp_path_factory.mktemp("browser") / "run", errors={})
     report.write_report(run)
     return run
 
@@ -163,7 +163,7 @@ def test_errors_and_timeouts_are_drawn_as_no_result_shown_first_and_grouped(brow
 
 
 def test_why_a_failure_failed_is_drawn_and_said(browser, tmp_path):
-    run = write_run(tmp_path / "run", error=None)
+    run = write_run(tmp_path / "run", errors={})
     first, second = [o for o in failures(run.outcomes) if o.case.level == 1][:2]
     x_m, v_mps = first.case.x_pov0_m, first.case.v_pov0_mps
     below_m, above_m = round(x_m - 3.1, 1), round(x_m + 12.0, 1)

@@ -73,7 +73,7 @@ class TestThePage:
         assert root.xpath("//@style") == []
 
     def test_shows_what_comes_from_outside_as_text(self, tmp_path):
-        run = write_run(tmp_path / "run", vut=EVIL, error=EVIL, sampler=EVIL)
+        run = write_run(tmp_path / "run", vut=EVIL, errors={179: EVIL}, sampler=EVIL)
         page = report_page(run, learns=False)
         root = root_of(page)
         assert len(root.xpath("//script")) == 2
@@ -113,7 +113,7 @@ class TestWhatWasNotTested:
         assert broken.index('id="untested"') < broken.index('id="facts"')
 
     def test_ends_with_what_the_controller_printed_last(self, tmp_path):
-        run = write_run(tmp_path / "run", 10, error=None)
+        run = write_run(tmp_path / "run", 10, errors={})
         lines = [f"line {n} </pre><script>" for n in range(1000)]
         (run.folder / LOG).write_text("\x1b[31m" + "\n".join(lines), encoding="utf-8")
         page = report_page(run, learns=False)

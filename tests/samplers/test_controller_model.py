@@ -7,10 +7,8 @@ import math
 
 import numpy as np
 import pytest
-from support.campaigning import campaign_settings, run_campaign
 from support.plans import POVS, plan_for
 
-from merge_sumo.campaigns.recorded import RecordedCampaign
 from merge_sumo.drivers.policies import HUMAN, policies_in, policies_of
 from merge_sumo.metrics.criterion import Criterion
 from merge_sumo.metrics.outcome import Outcome, Prediction
@@ -19,14 +17,10 @@ from merge_sumo.road.loader import centre_lines, road_for
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.samplers.controller_model import FAR, ControllerModel, ModelRollout, TreeInputs
 from merge_sumo.samplers.coverage import CoverageSampler
-from merge_sumo.scenario.case import (
-    Pool,
-)
+from merge_sumo.scenario.case import Pool
 from merge_sumo.scenario.scenario import US23
 from merge_sumo.simulation.evaluate import simulate
 from merge_sumo.simulation.povs import Povs
-
-SETTINGS = campaign_settings(vut="design2", levels=(0, 1), cases=60, seed=2)
 
 
 def slows(inputs: np.ndarray) -> np.ndarray:
@@ -54,11 +48,6 @@ def gaps_of(outcomes) -> np.ndarray:
 @pytest.fixture(scope="module")
 def seen():
     return ran("design1", 0, np.random.default_rng(3).random((60, 2)))
-
-
-@pytest.fixture(scope="module")
-def whole(tmp_path_factory) -> RecordedCampaign:
-    return run_campaign(SETTINGS, tmp_path_factory.mktemp("whole") / "run")
 
 
 class TestRollouts:
@@ -160,15 +149,6 @@ class TestPrediction:
         one = Prediction.of(np.array([[1.23456, math.nan]]), 0.5, 0.25, 0.4)
         assert one.dx_m == ((1.2346, None),)
         assert decode(json.dumps(to_plain(one)), Prediction) == one
-
-
-class TestACampaign:
-    def test_records_predictions_near_the_outcomes(self, whole):
-        known = [o for o in whole.outcomes if o.prediction is not None]
-        assert len(known) >= 40
-        last = known[-20:]
-        off = [abs(np.nanmedian(o.prediction.gaps_m) - o.measures.dx_m) for o in last]
-        assert np.median(off) < 3.0
 
 
 def test_a_sampler_without_a_model_uses_the_surrogate_alone(seen):

@@ -1,4 +1,4 @@
-"""`coverage`: what it takes a case to be worth, and that it finds what others do not."""
+"""`coverage`: the worth of a case, and a comparison with uniform sampling."""
 
 # mypy: no-strict-optional
 

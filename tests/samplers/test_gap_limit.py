@@ -38,13 +38,8 @@ def searched(limit_m: float, fail_when: str, cases: int, vut: str = "level0"):
     plan = settings.load_plan().with_engine("kinematic")
     ran = simulate(plan, settings.pool.cases(points, 0))
     outcomes = [one.at(place, 0).outcome for place, one in enumerate(ran)]
-    return (
-        settings,
-        plan,
-        points,
-        outcomes,
-        {place: one.trajectory.motion for place, one in enumerate(ran)},
-    )
+    motions = {place: one.trajectory.motion for place, one in enumerate(ran)}
+    return settings, plan, points, outcomes, motions
 
 
 @pytest.mark.parametrize(("limit_m", "fail_when"), [*LIMITS, (6.0, PAPER)])
@@ -64,7 +59,7 @@ def test_failures_of_a_scenario_are_predicted_within_its_own_limit(limit_m, fail
 
 
 @pytest.mark.parametrize(("limit_m", "fail_when"), LIMITS)
-def test_a_twin_and_a_pair_of_them_predict_failures_within_it(limit_m, fail_when):
+def test_a_model_and_a_pair_of_them_predict_failures_within_it(limit_m, fail_when):
     settings, plan, points, outcomes, motions = searched(limit_m, fail_when, 160)
     _, old_plan, _, old, old_motions = searched(limit_m, fail_when, 160, "design1")
     model = controller_model_of(plan, settings.pool, settings.seed)
@@ -78,7 +73,7 @@ def test_a_twin_and_a_pair_of_them_predict_failures_within_it(limit_m, fail_when
     regressions = [regression(*versions) for versions in zip(outcomes, old, strict=True)]
     for predictor, ran in ((model, outcomes), (pair, regressions)):
         gaps = predictor.predict({0: points[80:]})[0]
-        said = np.abs(np.median(gaps, axis=0)) < 1.0
+        predicted = np.abs(np.median(gaps, axis=0)) < 1.0
         failed = np.array([outcome.failed for outcome in ran[80:]])
         assert failed.any()
-        assert np.mean(said == failed) > 0.9
+        assert np.mean(predicted == failed) > 0.9

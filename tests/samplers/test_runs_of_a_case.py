@@ -1,4 +1,4 @@
-"""P(fail) from k failures of n runs: what a case that ran several times says."""
+"""P(fail) from k failures of n runs of a case."""
 
 # mypy: no-strict-optional
 
@@ -22,7 +22,7 @@ CASE = Case(level=0, x_pov0_m=-260.0, v_pov0_mps=30.0, scenario=US23)
 OTHER = replace(CASE, v_pov0_mps=31.0)
 
 
-def told(*runs: tuple[Case, int, float, float], tolerated: float = 0.0) -> LevelHistory:
+def history_of_runs(*runs: tuple[Case, int, float, float], tolerated: float = 0.0) -> LevelHistory:
     """Return the history of runs (case, draw, score, dx)."""
     sampler = make_sampler("uniform", Pool(levels=(0,), scenario=US23), 0)
     sampler.tolerated = tolerated
@@ -54,7 +54,7 @@ RUNS = (
     [(0.0, True), (0.49, True), (0.5, False)],
 )
 def test_a_case_has_one_row_with_its_worst_run(tolerated, failed):
-    history = told(*RUNS, tolerated=tolerated)
+    history = history_of_runs(*RUNS, tolerated=tolerated)
     assert len(history.points) == 2
     assert history.runs.tolist() == [4, 1]
     assert history.failures.tolist() == [2, 0]

@@ -1,4 +1,4 @@
-"""A search goes on where the model of the controller is sure of itself, and wrong."""
+"""A search whose model of the controller is confident and wrong."""
 
 from __future__ import annotations
 

@@ -3,7 +3,7 @@
 It merges before a POV that keeps its speed, as at level 0: it decides at the start which gap at M
 it wants, and keeps the acceleration that leads there. Where its gap with 0.5 m/s2 would be below
 8 m, it wants a gap of 0 with a probability that rises with the speed of the POV, and fails;
-otherwise it wants a gap of 30 m. Elsewhere it goes on as it is, and passes.
+otherwise it wants a gap of 30 m. Elsewhere it accelerates by 0.5 m/s2, and passes.
 """
 
 from __future__ import annotations

@@ -24,10 +24,10 @@ FOLLOWED_UP = [name for name, one in OURS.items() if one.only_with == FOLLOW_UP]
 
 
 def drive(case: Case, error: str | None = None, *, timeout: bool = False) -> Trajectory:
-    """Return an episode: the POV brakes a little at level 1 and 2, the VUT coasts from 3 s.
+    """Return an episode: the POV brakes a little at levels 1 and 2, the VUT coasts from 3 s.
 
-    In a timeout it brakes instead, and stands until 12 s. Other cars of the mainline keep their
-    speed.
+    In a timeout the VUT brakes to a stop instead, for 12 s. Other cars of the mainline keep their
+    speeds.
     """
     starts = np.array(case.starts())
     x, v = starts[:, 0], starts[:, 1]
@@ -65,7 +65,6 @@ def write_run(
     folder: Path,
     per_level: int = 60,
     levels: tuple[int, ...] = (0, 1, 2),
-    error: str | None = "answered nan",
     errors: Mapping[int, str] | None = None,
     timeouts: Collection[int] = (),
     scenario: Scenario = US23,
@@ -73,7 +72,7 @@ def write_run(
 ) -> RecordedCampaign:
     """Write a campaign of `per_level` cases at each level and return it.
 
-    The last case errs, or instead of it those in `errors` and `timeouts`, by index.
+    By default the last case has an error, else those in `errors` and `timeouts`, by index.
     """
     by_level = [cases_of(level, per_level, scenario) for level in levels]
     cases = [case for group in zip(*by_level, strict=True) for case in group]
@@ -89,7 +88,7 @@ def write_run(
         **settings,
     }
     if errors is None:
-        errors = {len(cases) - 1: error} if error is not None and not timeouts else {}
+        errors = {} if timeouts else {len(cases) - 1: "answered nan"}
     journal = Journal.create(folder, record)
     for batch, first in enumerate(range(0, len(cases), BATCH)):
         ran = []
