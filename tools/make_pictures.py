@@ -60,13 +60,9 @@ def picture_of_gui(scenario: Path, picture: Path, time_s: float) -> None:
         etree.SubElement(view, "snapshot", file=str(picture.resolve()), time=str(time_s))
         etree.ElementTree(view).write(folder / VIEW)
         config = etree.parse(folder / CONFIG, parser).getroot()
-        only = config.find("gui_only")
-        assert only is not None, "a scenario is for sumo-gui"  # noqa: S101
-        for option in ("delay", "quit-on-end", "breakpoints"):
-            for found in only.findall(option):
-                only.remove(found)
-        etree.SubElement(only, "delay", value="0")
-        etree.SubElement(only, "quit-on-end", value="true")
+        etree.strip_elements(config, "delay", "quit-on-end", "breakpoints")
+        etree.SubElement(config, "delay", value="0")
+        etree.SubElement(config, "quit-on-end", value="true")
         etree.ElementTree(config).write(folder / CONFIG)
         reason = run_program("sumo-gui", ["-c", CONFIG], folder, limit_s=None)
         assert not reason, reason  # noqa: S101

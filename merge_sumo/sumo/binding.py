@@ -1,4 +1,4 @@
-"""The SUMO installation: its library and its programs, or an error that names a missing part."""
+"""The SUMO installation: its library and its programs."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import re
 import subprocess
 import tempfile
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -21,12 +21,12 @@ DEBIAN_PACKAGES = "libgl1 libx11-6 libxext6 libxrender1 libatomic1 libexpat1"
 LOADER_FAILED = 127
 """Exit code of a program whose shared libraries are missing."""
 SUMO_VERSION = "1.28.0"
-"""The version with known motions; pyproject.toml pins the same."""
+"""The version whose motions are tested; pyproject.toml pins the same."""
 PROGRAM_LIMIT_S = 15.0
-"""Time that SUMO has for an episode; it needs a tenth of a second."""
+"""Maximum time of SUMO for an episode, which takes a tenth of a second."""
 
 SPEED_MODE_COMMANDED = 32
-"""SUMO's own checks are off: the vehicle drives at the speed that it is told."""
+"""Speed mode without SUMO's own checks: the vehicle drives at the commanded speed."""
 SUMO_OPTIONS = (
     *("--step-length", str(DT_S)),
     *("--insertion-checks", "none"),
@@ -37,19 +37,19 @@ SUMO_OPTIONS = (
     *("--no-warnings", "true"),
     *("--duration-log.disable", "true"),
 )
-"""Of every simulation; collisions have an option of their own."""
+"""Options of every simulation, except on collisions."""
 NO_COLLISIONS = ("--collision.action", "none")
-"""SUMO looks for none: measures show which vehicles touch."""
+"""SUMO does not search for collisions, as measures show which vehicles touch."""
 NOT_A_NAME = re.compile(r"[,:%\ud800-\udfff]|\$\{")
-"""To SUMO a comma parts names, a colon parts host and port, and the others stand for something."""
+"""Not possible in a path for SUMO: it splits at commas and colons, and substitutes the others."""
 
 
 @contextmanager
 def scratch_folder() -> Iterator[Path]:
-    """Give a temporary folder with a name that SUMO can use.
+    """Yield a temporary folder with a name that SUMO can use.
 
     Raises:
-        UserError: there is none.
+        UserError: the folder for temporary files has another name, or cannot be written.
     """
     try:
         above = Path(tempfile.gettempdir())
@@ -68,10 +68,13 @@ def scratch_folder() -> Iterator[Path]:
 
 
 def load_libsumo() -> Any:
-    """Import and return libsumo.
+    """Import libsumo.
+
+    Returns:
+        The module.
 
     Raises:
-        UserError: the module or a system library is missing, or it is of another version: a package
+        UserError: the module or a system library is missing, or it has another version: a package
             such as libtraci may have replaced it.
     """
     try:
@@ -102,31 +105,27 @@ def _library_missing(name: str, reason: str) -> UserError:
 
 
 def sumo_program(name: str) -> str:
-    """Return the path of a SUMO program ("sumo", "sumo-gui").
+    """Return the path of a SUMO program.
 
-    The wheel puts a Python wrapper on the PATH; killing that leaves the program running, so the
-    program itself is started.
+    The program on the PATH is a wrapper in Python. Killing that one leaves the program running.
+
+    Args:
+        name: name of the program, such as "sumo-gui".
 
     Raises:
-        UserError: it is missing.
+        UserError: the program is missing.
     """
-    try:
-        home = Path(importlib.import_module("sumo").SUMO_HOME)
-    except (ImportError, AttributeError) as error:
-        raise UserError(
-            f"{name} is not installed: run `pip install eclipse-sumo==1.28.0`"
-        ) from error
-    program = home / "bin" / name
-    if not program.is_file():
-        raise UserError(
-            f"{name} is missing in {program.parent}: run `pip install --force-reinstall "
-            "eclipse-sumo==1.28.0`"
-        )
-    return str(program)
+    with suppress(ImportError, AttributeError):
+        program = Path(importlib.import_module("sumo").SUMO_HOME, "bin", name)
+        if program.is_file():
+            return str(program)
+    raise UserError(
+        f"{name} is missing: run `pip install --force-reinstall eclipse-sumo=={SUMO_VERSION}`"
+    )
 
 
 def sumo_environment() -> dict[str, str]:
-    """Return the environment for a SUMO program, with the variables of the installation."""
+    """Return the environment variables of a SUMO program."""
     others = {key: value for key, value in os.environ.items() if not key.startswith("SUMO_")}
     return {**others, "SUMO_HOME": str(Path(sumo_program("sumo")).parents[1])}
 
@@ -134,19 +133,23 @@ def sumo_environment() -> dict[str, str]:
 def run_program(
     name: str, arguments: Sequence[str], folder: Path, limit_s: float | None = PROGRAM_LIMIT_S
 ) -> str:
-    """Run a SUMO program, with the environment of the installation.
+    """Run a SUMO program to its end.
 
     Args:
-        name: the program, as "sumo".
-        arguments: its arguments.
-        folder: the folder in which it runs.
-        limit_s: time after which it is killed. Without a limit its errors go to the terminal.
+        name: name of the program, such as "sumo".
+        arguments: arguments of its command line.
+        folder: working folder.
+        limit_s: time after which it is killed, in s; None for no limit.
 
     Returns:
-        The reason of its failure in a line; empty where it has not failed.
+        The reason of its failure in a line; empty for exit code 0.
 
     Raises:
         UserError: the program or a shared library is missing.
+
+    Example:
+        >>> run_program("sumo", ["-c", "replay.sumocfg"], Path("scenarios/pov-yields"))
+        ''
     """
     try:
         done = subprocess.run(

@@ -1,8 +1,10 @@
-"""The road as OpenDRIVE, for simulators other than SUMO."""
+"""Convert the road of a merge to OpenDRIVE, for other simulators."""
 
 from __future__ import annotations
 
 import hashlib
+
+from lxml import etree
 
 from merge_sumo.errors import UserError
 from merge_sumo.road.road import Road
@@ -14,13 +16,19 @@ ROAD = "road.xodr"
 ENTRY = "entry"
 """OpenDRIVE's type of an acceleration lane."""
 CONVERSION_LIMIT_S = 180.0
-"""Time that netconvert has for a net; it needs 10 s for that of a city."""
+"""Maximum time of netconvert, which takes 10 s for the net of a city."""
 
 
 def opendrive(road: Road) -> bytes:
-    """Return the net of a road as OpenDRIVE in the same coordinates.
+    """Return the net of a road as OpenDRIVE, in the same coordinates.
 
     netconvert draws its own ways over junctions, up to a metre from SUMO's.
+
+    Args:
+        road: a road of a net file.
+
+    Returns:
+        The content of the OpenDRIVE file. An acceleration lane has the type "entry".
 
     Raises:
         UserError: the net file is missing or has changed, or netconvert refuses it.
@@ -28,11 +36,10 @@ def opendrive(road: Road) -> bytes:
     content = read_xml(road.path, "the net")
     if hashlib.sha256(content).hexdigest() != road.sha256:
         raise UserError(
-            f"the net {road.path} is not the one that was driven in: it changed; put that one there"
+            f"the net {road.path} has changed since the campaign: restore the file of the campaign"
         )
     net = harmless_net(road.path)
-    for element in [*net.iter("tlLogic", "roundabout")]:
-        net.remove(element)
+    etree.strip_elements(net, "tlLogic", "roundabout", with_tail=False)
     for connection in net.iterfind("connection"):
         for name in ("tl", "linkIndex", "via"):
             connection.attrib.pop(name, "")
@@ -45,7 +52,7 @@ def opendrive(road: Road) -> bytes:
         arguments = [
             *("--sumo-net-file", NET, "--opendrive-output", ROAD),
             *("--offset.disable-normalization", "true"),
-            # It smooths the corners of a shape by itself, by metres; SUMO drives along them.
+            # By default it smooths the corners of a shape by metres; SUMO drives along them.
             *("--opendrive-output.straight-threshold", "180"),
             *("--precision", "6", "--no-warnings", "true", "--xml-validation", "never"),
         ]

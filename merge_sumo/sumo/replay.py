@@ -1,7 +1,7 @@
-"""Plays a replay folder in headless SUMO and compares it with what was recorded.
+"""Play a replay folder in SUMO and compare the motion with the record.
 
-Of the folder the case, the record and the net are read, as data. SUMO runs on files that are
-written from them into a temporary folder, as in an export.
+The folder may have been received: its case, record and net are read as data, and SUMO runs on new
+files that are written from them into a temporary folder.
 """
 
 from __future__ import annotations
@@ -56,24 +56,24 @@ from merge_sumo.sumo.replay_folder import (
 
 REPLAYED = "replayed.fcd.xml"
 TOLERANCE = 1e-6
-"""Metres and m/s; the record is written with nine digits."""
+"""Maximum difference in m and m/s; a record has nine digits."""
 MAX_TIMESTEPS = round((MAX_EPISODE_S + MAX_FOLLOW_UP_S) / DT_S) + 1 + HOLD_STEPS
 COLUMNS = ("x", "y", "speed", "pos")
-"""Numbers of a vehicle in floating car data."""
+"""Numbers of a vehicle in floating car data; "pos" is a position on a lane."""
 SPEED, POSITION = 2, 3
 COMPARED = 3
-"""The first columns: the position is that of a lane."""
+"""Number of the first columns that are compared."""
 
 
 @dataclass(frozen=True, slots=True, repr=False)
 class Replay(Result):
-    """A headless replay, compared with its record.
+    """The comparison of a replay with its record.
 
     Attributes:
-        rows: number of rows that were compared.
-        diverged_at_s: time of the first row that differs; None where none does.
-        detail: the difference.
-        words: the case and its cause, and when a later begin is.
+        rows: number of compared rows, over all vehicles.
+        diverged_at_s: time of the first row that differs; None where the replay is identical.
+        detail: the difference in words.
+        words: lines on the case, its cause, and a later begin.
 
     Example:
         >>> ms.replay("scenarios/pov-yields").identical
@@ -89,12 +89,12 @@ class Replay(Result):
 
     @property
     def is_good(self) -> bool:
-        """See `Result`."""
+        """Whether the replay is identical."""
         return self.identical
 
     @property
     def identical(self) -> bool:
-        """True where no row differs."""
+        """Whether no row differs."""
         return self.diverged_at_s is None
 
     def lines(self) -> list[str]:
@@ -105,22 +105,26 @@ class Replay(Result):
 
 
 def replay(folder: Path, from_s: float | None = None) -> Replay:
-    """Replay a folder in headless SUMO and compare every row of all vehicles with the record.
+    """Replay a folder in SUMO without a window, and compare all vehicles in every row.
 
-    Positions and speeds must agree within 1e-6, and the record must be an episode: all vehicles on
-    their lanes, moved by eq. (4) and held at its end. SUMO plays the positions on the lanes of the
-    record, so these must agree with its x and y, too.
+    The record itself must be an episode, whose vehicles are on their lanes, move by eq. (4) and
+    stand at the end. SUMO plays the positions on lanes, which must agree with x and y of the
+    record.
 
     Args:
-        folder: the replay folder, which may have been received.
-        from_s: SUMO begins at this time before the first conflict, in s, below 0, in the state that
-            it has there in the whole replay.
+        folder: the replay folder.
+        from_s: begin before the first conflict, in s, not above 0; None for the start of the
+            episode. SUMO begins in the state of that time.
 
     Returns:
-        The comparison.
+        The comparison, with a tolerance of 1e-6 m and m/s.
 
     Raises:
         UserError: the folder is not a replay folder, or SUMO cannot run it.
+
+    Example:
+        >>> replay(Path("scenarios/pov-yields")).identical
+        True
     """
     episode = _read(folder)
     first, begins = Conflict.of(episode.trajectory).begin(from_s)
@@ -136,27 +140,32 @@ def replay(folder: Path, from_s: float | None = None) -> Replay:
     motion = episode.trajectory.whole
     off_m = np.diff(motion[:, :, 0], axis=0) - motion[:-1, :, 1] * DT_S
     diverged_at_s, detail = None, ""
-    if place := _first(replayed - recorded):
-        row, car, column = place
+    if different := _first(replayed - recorded):
+        row, car, column = different
         diverged_at_s = (first + row) * DT_S
-        detail = f"{COLUMNS[column]} of {VEHICLES[car]} is {replayed[place]}, recorded "
-        detail += f"{recorded[place]}"
-    elif place := _first(off_m):
-        diverged_at_s = place[0] * DT_S
-        detail = f"{VEHICLES[place[1]]} is recorded as not moving at its speed"
+        detail = f"{COLUMNS[column]} of {VEHICLES[car]} is {replayed[different]}, recorded "
+        detail += f"{recorded[different]}"
+    elif different := _first(off_m):
+        row, car = different
+        diverged_at_s = row * DT_S
+        detail = f"{VEHICLES[car]} is recorded as not moving at its speed"
     outcome = episode.outcome
     words = case_line(outcome.case, outcome.index), cause(outcome, episode.trajectory), *begins
     return Replay(count * cars, diverged_at_s, detail, words)
 
 
 def _first(difference: FloatArray) -> tuple[int, ...]:
-    """Return the place of the first difference above the tolerance; empty without one."""
-    places = np.argwhere(~(np.abs(difference) <= TOLERANCE)).tolist()
-    return tuple(places[0]) if places else ()
+    """Return the index of the first number above the tolerance; empty without one."""
+    indices = np.argwhere(~(np.abs(difference) <= TOLERANCE)).tolist()
+    return tuple(indices[0]) if indices else ()
 
 
 def check_display() -> None:
-    """Raise `UserError` without a display."""
+    """Check that sumo-gui has a display.
+
+    Raises:
+        UserError: it has none.
+    """
     if os.name == "posix" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         raise UserError(
             "sumo-gui needs a display and DISPLAY is not set: use a desktop or xvfb-run"
@@ -167,9 +176,9 @@ def open_gui(folder: Path, from_s: float | None = None, *, silent: bool = False)
     """Open a replay folder in sumo-gui and wait until it is closed.
 
     Args:
-        folder: the replay folder, which may have been received.
-        from_s: as in `replay`.
-        silent: whether no notice says when it begins.
+        folder: the replay folder.
+        from_s: begin before the first conflict, as in `replay`.
+        silent: whether to print no notice of the begin.
 
     Returns:
         1 where sumo-gui failed, else 0.
@@ -180,19 +189,16 @@ def open_gui(folder: Path, from_s: float | None = None, *, silent: bool = False)
     check_display()
     episode = _read(folder)
     first, begins = Conflict.of(episode.trajectory).begin(from_s)
-    for sentence in [] if silent else begins:
-        notice(sentence)
+    if not silent:
+        for sentence in begins:
+            notice(sentence)
     with stopping_in_order(), _staged(episode, first) as (stage, arguments):
         return int(run_program("sumo-gui", arguments, stage, limit_s=None) != "")
 
 
 @dataclass(frozen=True, slots=True)
 class _Episode:
-    """The content of a replay folder.
-
-    Attributes:
-        record: `COLUMNS` of each vehicle at each step, (T, A, 4).
-    """
+    """The content of a replay folder, with a record of `COLUMNS`, (T, A, 4)."""
 
     road: ReplayRoad
     outcome: Outcome
@@ -201,15 +207,13 @@ class _Episode:
 
 
 def _read(folder: Path) -> _Episode:
-    """Read case, record and net of a folder that may have been received."""
-    if not folder.is_dir():
+    """Read case, record and net of a folder as data."""
+    if not (folder / CASE).exists():
         raise UserError(
-            f"there is no folder {folder}: name a replay folder, or a campaign and a case"
+            f"{folder} is not a replay folder: it has no {CASE}; name a replay folder, or a "
+            "campaign and a case"
         )
     net = HOSTED_NET if (folder / HOSTED_NET).exists() else NET
-    for name in (net, CASE, RECORD):
-        if not (folder / name).exists():
-            raise UserError(f"{folder} is not a replay folder: it has no {name}")
     outcome = _outcome(folder / CASE)
     road = _road(folder / net, outcome)
     name, cars = f"the record {folder / RECORD}", outcome.case.scenario.vehicles
@@ -254,49 +258,48 @@ def _road(path: Path, outcome: Outcome) -> ReplayRoad:
 
 
 def _record(path: Path, name: str) -> tuple[FloatArray, dict[tuple[int, int], str]]:
-    """Return floating car data, and the lane of each vehicle by (step, row).
+    """Read floating car data.
 
-    The data are `COLUMNS` of each vehicle at each step, (T, A, 4); NaN where it is missing.
+    Returns:
+        `COLUMNS` of each vehicle at each step, (T, A, 4), NaN where a vehicle is missing; and the
+        lane of each vehicle by (step, vehicle).
     """
     root = parse_xml(read_xml(path, "the record"), name, RECORD_TAGS)
     record = np.full((MAX_TIMESTEPS, len(VEHICLES), len(COLUMNS)), np.nan)
     lanes: dict[tuple[int, int], str] = {}
-    for car in root.iterfind("timestep/vehicle"):
-        above, values = car.getparent(), {str(key): str(value) for key, value in car.items()}
-        assert above is not None, "a timestep"  # noqa: S101
-        try:
-            step = float(above.attrib["time"]) / DT_S
-            place = round(step), VEHICLES.index(values["id"])
-            numbers = [float(values[column]) for column in COLUMNS]
-            in_range = all(abs(number) <= FARTHEST_M for number in numbers)
-            if step < 0.0 or abs(step - place[0]) > TOLERANCE or place in lanes or not in_range:
-                raise ValueError("it is out of range, between steps, or repeats one")
-            record[place] = numbers
-            lanes[place] = values["lane"]
-        except (IndexError, KeyError, OverflowError, ValueError) as error:
-            raise UserError(
-                f"{name} has a missing or wrong value in line {car.sourceline} ({error!r:.100})"
-            ) from error
+    for timestep in root.iterfind("timestep"):
+        for car in timestep.iterfind("vehicle"):
+            try:
+                step = float(timestep.attrib["time"]) / DT_S
+                index = round(step), VEHICLES.index(str(car.attrib["id"]))
+                numbers = [float(car.attrib[column]) for column in COLUMNS]
+                in_range = all(abs(number) <= FARTHEST_M for number in numbers)
+                if step < 0.0 or abs(step - index[0]) > TOLERANCE or index in lanes or not in_range:
+                    raise ValueError("it is out of range, between steps, or repeats one")
+                record[index] = numbers
+                lanes[index] = str(car.attrib["lane"])
+            except (IndexError, KeyError, OverflowError, ValueError) as error:
+                raise UserError(
+                    f"{name} has a missing or wrong value in line {car.sourceline} ({error!r:.100})"
+                ) from error
     return record, lanes
 
 
 def _motion(
     record: FloatArray, lanes: dict[tuple[int, int], str], road: Road, name: str
 ) -> FloatArray:
-    """Return the motion of a record without the rows that hold its end, (T, A, 3).
-
-    The VUT has the lanes of the ramp, and that of the mainline next to an acceleration lane.
-    """
+    """Return the motion of a record without the rows that hold its end, (T, A, 3)."""
     starts_m = np.zeros(record.shape[:2])
     main = {piece.lane: piece.start_m for piece in road.mainline.pieces}
-    ramp = {piece.lane: piece.start_m for piece in road.ramp.pieces}
+    # On the mainline, too, where it has merged from an acceleration lane.
+    of_vut = main | {piece.lane: piece.start_m for piece in road.ramp.pieces}
     for (step, car), lane in lanes.items():
-        own = main | ramp if car == VUT else main
-        if lane not in own:
+        start_m = (of_vut if car == VUT else main).get(lane)
+        if start_m is None:
             raise UserError(
                 f"{name} has {VEHICLES[car]} on lane {lane:.40}, which is not on its path"
             )
-        starts_m[step, car] = own[lane]
+        starts_m[step, car] = start_m
     x_m, v_mps = starts_m + record[:, :, POSITION], record[:, :, SPEED]
     a_mps2 = np.diff(v_mps, axis=0, append=v_mps[-1:]) / DT_S
     motion = np.stack((x_m, v_mps, a_mps2), axis=2)[:-HOLD_STEPS]
@@ -306,19 +309,19 @@ def _motion(
 
 @contextmanager
 def _staged(episode: _Episode, first: int) -> Iterator[tuple[Path, list[str]]]:
-    """Yield a temporary folder with all that SUMO reads, and what has it play from a row on.
+    """Yield a temporary folder with the files of an episode, and the arguments to play them.
 
-    SUMO begins one row earlier and inserts each vehicle where it last was outside of junctions: the
-    route that it gives it begins there, and decides between lanes that lie on each other.
+    SUMO begins one row before `first`. It inserts each vehicle where it last was outside of
+    junctions: the route of the vehicle begins there, and decides between lanes that overlap.
     """
     record = motion_record(episode.road.road, episode.trajectory)
     row = max(first - 1, 0)
-    inserted = {car.get("id"): car for car in record[0]}
+    inserted = {}
     for step in [*record][: row + 1]:
         for car in step:
-            if ":" not in car.get("lane", ""):
+            if step is record[0] or ":" not in car.get("lane", ""):
                 inserted[car.get("id")] = car
-    record[row][:] = [*inserted.values()]
+    record[row][:] = inserted.values()
     with scratch_folder() as stage:
         files = files_of(episode.road, episode.outcome, episode.trajectory, record)
         for name, content in files.items():

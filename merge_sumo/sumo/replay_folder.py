@@ -1,11 +1,7 @@
-"""An episode as a folder that sumo and sumo-gui play by themselves.
+"""Write an episode as a folder that sumo and sumo-gui play without merge-sumo.
 
-On the shipped road it is played in the shipped net. Of any other road the folder has the net that
-hosts it (`hosting`), with a speed limit above all speeds: there lanes have ids and ends that every
-reader can check, and where the road continues after the end of the file, so does that net. A VUT on
-an acceleration lane is on the lane of the mainline from the row in which it has merged. Labels are
-at fixed places above the road, as points of interest with a text: names at the cars would cover
-each other at M.
+The folder has the net of the paper's scenario, or for another road the net of `net_copies` with one
+copy, whose lanes have known ids, continue beyond the net file and limit no speed.
 """
 
 from __future__ import annotations
@@ -29,40 +25,52 @@ from merge_sumo.road.loader import road_of
 from merge_sumo.road.road import LanePath, Road
 from merge_sumo.road.xml_input import to_bytes
 from merge_sumo.scenario.case import Case, FloatArray, described
-from merge_sumo.scenario.scenario import DT_S, VEHICLES, VUT, Bounds, level_name, rgb
+from merge_sumo.scenario.scenario import COLOURS, DT_S, VEHICLES, VUT, Bounds, level_name
 from merge_sumo.scenario.trajectory import Trajectory
 from merge_sumo.sumo.net_copies import COPY, LANE, hosted_net
 
 CONFIG = "replay.sumocfg"
 NET = "us23.net.xml"
-"""The net of the shipped road."""
+"""Net of the paper's scenario."""
 HOSTED_NET = "road.net.xml"
-"""The net of any other road."""
+"""Net of any other road."""
 LANE_EDGE = LANE.replace(COPY, ".0")
 """Edge of that net with an acceleration lane and the mainline next to it."""
 TYPES = "vehicles.add.xml"
+"""Types of the vehicles."""
 LABELS = "labels.add.xml"
+"""Case, cause and legend above the road. Names at the cars would cover each other at M."""
 RECORD = "episode.fcd.xml"
+"""Motion of the vehicles as floating car data."""
 VIEW = "view.settings.xml"
+"""View of sumo-gui."""
 CASE = "case.json"
+"""Scenario and outcome."""
 SCENARIO = "scenario"
-"""Key of the scenario in that file, next to those of the outcome."""
+"""Key of the scenario in `CASE`."""
 SHAPE = 614.0 / 1270.0
-"""Height of the picture in the window of sumo-gui, as a share of its width."""
+"""Height of the view in the window of sumo-gui, as a share of its width."""
 REAL_TIME_MS = "1000"
-"""Of delay for each simulated second, which is how SUMO 1.28 takes the option."""
+"""Delay of sumo-gui for each simulated second: SUMO 1.28 counts it so."""
 HOLD_STEPS = 10
-"""Steps for which the last picture stays."""
+"""Number of rows of a record that repeat the last one, so that the last picture stays."""
 NAMES = {"pov": "POV", "vut": "VUT", "ahead": "car ahead", "behind": "car behind"}
 TEXT = "text"
-"""Parameter of a point of interest that is shown."""
+"""Parameter of a point of interest that sumo-gui shows."""
 PALE = "0.93,0.93,0.90"
 INK = "0.1,0.1,0.1"
 
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """The picture of sumo-gui: its zoom, its middle, and its width on the road."""
+    """The view of sumo-gui on the road.
+
+    Attributes:
+        zoom: SUMO's number for the zoom, in %.
+        x_m: eastward coordinate of the middle in the net.
+        y_m: northward coordinate of the middle in the net.
+        width_m: width of the view on the road.
+    """
 
     zoom: str
     x_m: float
@@ -70,32 +78,44 @@ class Picture:
     width_m: float
 
     def place(self, right: float, up: float) -> tuple[float, float]:
-        """Return the place at shares of width and height from the middle."""
+        """Return a place of the view as x and y in the net, in m.
+
+        Args:
+            right: distance from the middle to the right, as a share of the width.
+            up: distance from the middle upwards, as a share of the height.
+        """
         return self.x_m + right * self.width_m, self.y_m + up * self.width_m * SHAPE
 
 
 @dataclass(frozen=True, slots=True)
 class ReplayRoad:
-    """The road of a replay folder."""
+    """The road of a replay folder.
+
+    Attributes:
+        net: content of the net file of the folder.
+        road: the road in that net.
+        file: name of the net file.
+    """
 
     net: bytes
     road: Road
-    """Found in that net, so that its lanes have the ids that they have there."""
     file: str
-    """Name of the net in the folder."""
 
 
 def write_scenario(folder: Path, road: Road, outcome: Outcome, trajectory: Trajectory) -> Path:
-    """Write an episode as a replay folder and return the path of its configuration.
+    """Write an episode as a replay folder.
 
     Args:
         folder: the new folder.
-        road: the road of the scenario.
-        outcome: the outcome of the case.
-        trajectory: its motion.
+        road: road of the scenario.
+        outcome: outcome of the case.
+        trajectory: motion of the case.
+
+    Returns:
+        The path of the configuration, which `sumo -c` and `sumo-gui -c` play.
 
     Raises:
-        UserError: something else is there, or it cannot be written.
+        UserError: something else is there, or the folder cannot be written.
     """
     written = _road(road, folder)
     scenario = outcome.case.scenario.to_record() | {"net": None}
@@ -112,47 +132,47 @@ def _road(road: Road, folder: Path) -> ReplayRoad:
     if identity(road) == identity(shipped):
         return ReplayRoad(shipped.path.read_bytes(), shipped, NET)
     fast = replace(road, mainline=_fast(road.mainline), ramp=_fast(road.ramp))
-    content = hosted_net(fast, 1, lane_goes_on=True)
-    return ReplayRoad(
-        content, road_of_hosted(content, folder / HOSTED_NET, fast.lane_m), HOSTED_NET
-    )
+    net = hosted_net(fast, 1, lane_goes_on=True)
+    hosted = road_of_hosted(net, folder / HOSTED_NET, fast.lane_m)
+    return ReplayRoad(net, hosted, HOSTED_NET)
 
 
 def _fast(path: LanePath) -> LanePath:
-    """Return a path with a limit above every speed.
+    """Return a path without a speed limit.
 
     SUMO lets a vehicle enter a replay no faster than its lane allows.
     """
-    return LanePath(tuple(replace(piece, speed_limit_mps=200.0) for piece in path.pieces))
+    pieces = [replace(piece, speed_limit_mps=200.0) for piece in path.pieces]
+    return LanePath(tuple(pieces))
 
 
 def road_of_hosted(content: bytes, path: Path, lane_m: Bounds | None) -> Road:
-    """Find the road in the net of a folder.
+    """Find the road in a net that `hosted_net` has written.
 
     Args:
-        content: the net.
+        content: the net, which may have been received.
         path: its file, for messages.
-        lane_m: begin and end of the acceleration lane of its scenario.
+        lane_m: begin and end of the acceleration lane of the scenario; None for a merge at M.
 
     Returns:
-        The road.
+        The road, with the ids of that net.
 
     Raises:
         UserError: the net has no such road.
     """
     net = read_net(path, content)
-    numbered: dict[str, dict[int, str]] = {"main": {}, "ramp": {}, "out": {}}
-    for name in net.edges:
-        if found := re.fullmatch(r"(main|ramp|out)([0-9]{1,4})[.]0", name):
-            numbered[found[1]][int(found[2])] = name
-    main, ramp, out = ([names[n] for n in sorted(names)] for names in numbered.values())
-    # Without a ramp both vehicles drive on one path.
-    is_one_path = len(main) + len(out) == len(net.edges)
+    names = set(net.edges)
+    paths: dict[str, list[str]] = {"main": [], "ramp": [], "out": []}
+    for number in range(1, len(names) + 1):
+        for name, edges in paths.items():
+            if f"{name}{number}.0" in names:
+                edges.append(f"{name}{number}.0")
+    main, ramp, out = paths.values()
     lane = [] if lane_m is None else [LANE_EDGE]
     return find_road(
         net,
         main + lane + out,
-        (main if is_one_path else ramp) + lane + out,
+        (ramp or main) + lane + out,  # without a ramp all vehicles are on one path
         room_after_m=0.0,
         edge_at_m=out[0] if out else None,
         lane_m=lane_m and (lane_m[1], lane_m[1]),
@@ -162,16 +182,16 @@ def road_of_hosted(content: bytes, path: Path, lane_m: Bounds | None) -> Road:
 def files_of(
     road: ReplayRoad, outcome: Outcome, trajectory: Trajectory, record: etree._Element
 ) -> dict[str, bytes]:
-    """Return the files that SUMO reads of an episode, the configuration last.
+    """Return the files of an episode that SUMO reads.
 
     Args:
-        road: the road of the folder.
-        outcome: the outcome of the case.
-        trajectory: its motion.
-        record: the part of the motion that SUMO plays (`motion_record`).
+        road: road of the folder.
+        outcome: outcome of the case.
+        trajectory: motion of the case.
+        record: the part of `motion_record` that SUMO plays.
 
     Returns:
-        The contents by name.
+        The contents by name, the configuration last.
     """
     picture = _picture(road.road, record)
     roots = {
@@ -193,14 +213,14 @@ def _types(trajectory: Trajectory) -> etree._Element:
             root,
             "vType",
             id=name,
-            color=_colour(name),
+            color=COLOURS[name],
             guiShape="passenger/sedan",
             length=f"{length_m:g}",
             minGap="0",
-            # The replay inserts a vehicle at the highest speed it may drive: its first one here.
+            # SUMO inserts a vehicle of a replay at its maximum speed: that is the first one here.
             maxSpeed=f"{max(first_mps, 1e-9):.9f}",
             speedFactor="2",
-            # Nor does SUMO then slow it down for the junction.
+            # Then SUMO does not slow it down for the junction either.
             decel="1000",
             emergencyDecel="1000",
         )
@@ -208,7 +228,13 @@ def _types(trajectory: Trajectory) -> etree._Element:
 
 
 def motion_record(road: Road, trajectory: Trajectory) -> etree._Element:
-    """Return the motion as SUMO's floating car data, with the last row held."""
+    """Return a motion as SUMO's floating car data, followed by `HOLD_STEPS` copies of its end.
+
+    Args:
+        road: road of the folder.
+        trajectory: motion of the case. Where the VUT has merged from an acceleration lane it is on
+            the lane of the mainline.
+    """
     root = etree.Element("fcd-export")
     rows = [*zip(trajectory.whole.tolist(), merged_rows(trajectory).tolist(), strict=True)]
     rows += [rows[-1]] * HOLD_STEPS
@@ -228,7 +254,11 @@ def motion_record(road: Road, trajectory: Trajectory) -> etree._Element:
 
 
 def view_settings(picture: Picture) -> etree._Element:
-    """Return the settings of a view."""
+    """Return the settings of sumo-gui for a view.
+
+    Args:
+        picture: the view.
+    """
     root = etree.Element("viewsettings")
     scheme = etree.SubElement(root, "scheme", name="merge")
     etree.SubElement(scheme, "edges", laneShowBorders="1")
@@ -250,13 +280,8 @@ def view_settings(picture: Picture) -> etree._Element:
     return root
 
 
-def _colour(vehicle: str) -> str:
-    """Return the colour of a vehicle as SUMO writes it."""
-    return ",".join(f"{part / 255.0:.2f}" for part in rgb(vehicle))
-
-
 def _picture(road: Road, record: etree._Element) -> Picture:
-    """Return a picture of the way of the VUT; at a zoom of 100 it has the whole net."""
+    """Return a view of the way of the VUT. A zoom of 100 shows the whole net."""
     net = [(x, y) for path in (road.mainline, road.ramp) for _, x, y in path.corners()]
     driven = []
     for car in record.iterfind(f"timestep/vehicle[@id='{VEHICLES[VUT]}']"):
@@ -268,7 +293,7 @@ def _picture(road: Road, record: etree._Element) -> Picture:
 
 
 def _box(points: Sequence[tuple[float, float]]) -> tuple[float, FloatArray]:
-    """Return the width of a picture of points below the labels, and its middle."""
+    """Return the width of a view that has points below the labels, and its middle."""
     low, high = np.min(points, axis=0), np.max(points, axis=0)
     width_m, height_m = (high - low).tolist()
     return max(width_m, height_m / (0.8 * SHAPE)), (low + high) / 2.0
@@ -276,39 +301,37 @@ def _box(points: Sequence[tuple[float, float]]) -> tuple[float, FloatArray]:
 
 def _config(road: ReplayRoad, timesteps: int) -> etree._Element:
     end_s = timesteps * DT_S
-    sections = {
-        "input": {"net-file": road.file, "additional-files": f"{TYPES},{LABELS}"},
-        "time": {"begin": "0", "end": f"{end_s:.1f}", "step-length": f"{DT_S}"},
-        "processing": {
-            "collision.action": "none",
-            "insertion-checks": "none",
-            "time-to-teleport": "-1",
-            "default.speeddev": "0",
-        },
-        "fcd_replay_device": {"device.fcd-replay.files": RECORD},
-        "report": {"no-warnings": "true", "xml-validation": "never"},
-        "gui_only": {
-            "gui-settings-file": VIEW,
-            "start": "true",
-            "delay": REAL_TIME_MS,
-            # It halts there: at its end it would show a dialog over the last picture.
-            "breakpoints": f"{end_s - 2.0 * DT_S:.1f}",
-            "window-size": "1280,800",
-        },
+    options = {
+        "net-file": road.file,
+        "additional-files": f"{TYPES},{LABELS}",
+        "begin": "0",
+        "end": f"{end_s:.1f}",
+        "step-length": f"{DT_S}",
+        "collision.action": "none",
+        "insertion-checks": "none",
+        "time-to-teleport": "-1",
+        "default.speeddev": "0",
+        "device.fcd-replay.files": RECORD,
+        "no-warnings": "true",
+        "xml-validation": "never",
+        "gui-settings-file": VIEW,
+        "start": "true",
+        "delay": REAL_TIME_MS,
+        # It halts there: at its end it would show a dialog over the last picture.
+        "breakpoints": f"{end_s - 2.0 * DT_S:.1f}",
+        "window-size": "1280,800",
     }
     root = etree.Element("configuration")
-    for section, values in sections.items():
-        parent = etree.SubElement(root, section)
-        for name, value in values.items():
-            etree.SubElement(parent, name, value=value)
+    for name, value in options.items():
+        etree.SubElement(root, name, value=value)
     return root
 
 
 def _labels(outcome: Outcome, trajectory: Trajectory, picture: Picture) -> etree._Element:
-    """Return the case, its cause and a legend of the cars as an additional file."""
+    """Return case, cause and legend as points of interest with a text."""
     words = cause(outcome, trajectory).removesuffix(".")
     if outcome.measures.end.is_error:
-        words = words.partition(":")[0]  # a message may hold anything
+        words = words.partition(":")[0]  # without the message, which may hold anything
     lines = [case_line(outcome.case, outcome.index), *re.split(r"(?<=:) |\. ", words)]
     root = etree.Element("additional")
     for number, line in enumerate(lines[:4]):
@@ -316,12 +339,17 @@ def _labels(outcome: Outcome, trajectory: Trajectory, picture: Picture) -> etree
     cars = VEHICLES[: outcome.case.scenario.vehicles]
     for number, name in enumerate(cars):
         at = picture.place(0.13 * (number - 0.5 * (len(cars) - 1)), 0.315)
-        _label(root, name, at, NAMES[name], _colour(name), 0.012 * picture.width_m)
+        _label(root, name, at, NAMES[name], COLOURS[name], 0.012 * picture.width_m)
     return root
 
 
 def case_line(case: Case, index: int | None) -> str:
-    """Return which case it is, with its index where it has one."""
+    """Return index, level and coordinates of a case in one line.
+
+    Args:
+        case: the case.
+        index: index in its campaign; None for a single case.
+    """
     named = "" if index is None else f"case {index}, "
     return f"{named}POV level {level_name(case.level)}: {described(case)}"
 

@@ -43,9 +43,9 @@ def with_pictures(*arguments, **options):
 
 def that_ends(*arguments):
     root = config(*arguments)
-    root.find("gui_only/delay").set("value", "0")
-    etree.SubElement(root.find("gui_only"), "quit-on-end", value="true")
-    root.find("gui_only").remove(root.find("gui_only/breakpoints"))
+    root.find("delay").set("value", "0")
+    etree.SubElement(root, "quit-on-end", value="true")
+    root.remove(root.find("breakpoints"))
     return root
 
 replay_folder.view_settings, replay_folder._config = with_pictures, that_ends

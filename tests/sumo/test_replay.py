@@ -234,7 +234,7 @@ class TestAFolderThatCannotBeReplayed:
     def test_lacks_a_file_or_is_missing(self, folder, tmp_path):
         (folder / NET).unlink()
         assert NET in refusal(folder)
-        assert "there is no folder" in refusal(tmp_path / "nowhere")
+        assert "is not a replay folder" in refusal(tmp_path / "nowhere")
 
 
 @pytest.mark.parametrize("folder", SHIPPED, ids=lambda folder: folder.name)
