@@ -17,13 +17,12 @@ from support.handmade import write_run
 import merge_sumo as ms
 from merge_sumo.analysis.cases_file import CasesFile
 from merge_sumo.analysis.comparison import ComparedCase
-from merge_sumo.errors import UserError
 from merge_sumo.metrics.measures import Measures
 from merge_sumo.metrics.merge import Severity
 from merge_sumo.reports.cases_toml import write_cases
 from merge_sumo.reports.text import comparison_headline
 from merge_sumo.road.scenario_file import named_scenario, shipped_scenarios
-from merge_sumo.scenario.scenario import OWN, US23
+from merge_sumo.scenario.scenario import US23
 from merge_sumo.scenario.trajectory import End
 
 CONTROLLER = """
@@ -259,17 +258,6 @@ def test_scenarios_errors_and_timeouts_are_what_they_were(tmp_path):
         ends = {outcome.index: outcome.measures.end for outcome in kept.outcomes}
         assert ends == {0: "MERGED", 3: "VUT_ERROR", 5: "TIMEOUT"}
         assert kept.outcome(3).measures.error == 'said "no"'
-
-
-def test_a_pov_of_the_user_must_be_the_same(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "pov.py").write_text("def Pov(seen):\n    return 0.0\n")
-    settings = campaign_settings(vut="design2", pov="pov.py:Pov", levels=(OWN,), cases=10)
-    path = write_cases(run_campaign(settings, tmp_path / "run"), range(10), tmp_path)
-    assert not ms.rerun(path, pov="pov.py:Pov").worse
-    (tmp_path / "pov.py").write_text("def Pov(seen):\n    return 1.0\n")
-    with pytest.raises(UserError, match="against another POV of level own than today"):
-        ms.rerun(path, pov="pov.py:Pov")
 
 
 def test_a_net_of_the_user_is_found_from_the_file(tmp_path):

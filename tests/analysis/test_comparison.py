@@ -5,7 +5,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -160,24 +159,6 @@ def test_the_page_draws_both_motions_or_says_that_none_is_recorded(run):
     for version in compared.versions:
         object.__setattr__(version, "motion", lambda _: None)
     assert "No motion is recorded." in pages.comparison_page(compared)
-
-
-def test_a_rerun_in_which_cases_break_ends_with_1_although_more_are_fixed(
-    command_line, run, tmp_path, monkeypatch
-):
-    """Cases that broke decide, and not the volume of failures, which shrinks here."""
-    monkeypatch.chdir(tmp_path)
-    shutil.copytree(run.folder, "campaign")
-    # It fails in other places: further from where design1 does.
-    Path("late.py").write_text("def f(seen):\n    return 1.0 if seen.t_s < 2.0 else 0.0\n")
-    code, out, _ = command_line("rerun", "campaign", "--vut", "late.py:f", "--json")
-    told = json.loads(out)
-    changes = [case["change"] for case in told["steps"][0]["cases"]]
-    assert told["broke"] == changes.count("broke") > 0
-    assert code == 1
-    before, after = (version["levels"]["0"]["fmc"] for version in told["versions"])
-    assert after < before
-    assert told["source"].startswith("the cases come from the recorded search of design1")
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from dataclasses import replace
 
@@ -20,7 +19,6 @@ from merge_sumo.campaigns.settings import CampaignSettings, controllers, setting
 from merge_sumo.controllers.spec import ControllerOptions
 from merge_sumo.drivers.policies import policies_of
 from merge_sumo.drivers.reference_drivers import REFERENCE_DRIVERS, CarefulPov
-from merge_sumo.errors import UserError
 from merge_sumo.metrics.merge import brake_after_mps2
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.scenario.scenario import OWN, US23
@@ -35,11 +33,6 @@ def found(run, tmp_path_factory):
     found = write_avoidance(RunStudy(copy, settings, settings.load_plan()))
     assert AVOIDANCE.read_lines(copy) == found
     return found
-
-
-@pytest.fixture
-def folder(run, tmp_path):
-    return shutil.copytree(run.folder, tmp_path / "run")
 
 
 def passes(failure, driver, until, *, in_the_povs_place=False):
@@ -121,18 +114,3 @@ def test_a_pov_of_the_user_drives_again_in_sumo(run, found, tmp_path):
         failure = run.trajectory(one.index)
         failing.append((one.index, replace(failure, case=replace(failure.case, level=OWN))))
     assert avoidances(plan_for("careful", povs=povs), failing) == found[:4]
-
-
-class TestTheFile:
-    @pytest.mark.parametrize(
-        "change",
-        [{"index": 10_000}, {"avoided_by": ["nobody"]}, {"latest_takeover_s": "<b>"}, {"more": 1}],
-    )
-    def test_with_other_content_is_refused(self, folder, found, change):
-        AVOIDANCE.write_lines(folder, found)
-        path = folder / AVOIDANCE.name
-        lines = path.read_text().splitlines()
-        lines[0] = json.dumps(json.loads(lines[0]) | change)
-        path.write_text("\n".join(lines) + "\n")
-        with pytest.raises(UserError, match=r"line 1 of .* is not as it was written"):
-            AVOIDANCE.read_lines(RecordedCampaign(folder))

@@ -78,13 +78,6 @@ class TestACampaign:
             at_level = replace(worst.case, level=int(name), svo_rad=0.0 if name == "2" else None)
             assert passes(plan_for("design2"), at_level) == passed
 
-    def test_of_a_controller_of_the_user_explains_nothing_by_itself(self, tmp_path):
-        (tmp_path / "mine.py").write_text("def drive(seen):\n    return 1.0\n")
-        vut = f"{tmp_path / 'mine.py'}:drive"
-        own = ms.campaign(vut, level=0, sampler="uniform", cases=60, seed=1, out=tmp_path / "run")
-        assert own.failures
-        assert not (own.folder / EXPLANATIONS.name).exists()
-
     def test_is_not_explained_where_the_engines_differ(self, tmp_path, monkeypatch):
         monkeypatch.setattr(
             "merge_sumo.analysis.explanation.passes_without_contact", lambda _: True
