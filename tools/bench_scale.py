@@ -41,7 +41,7 @@ import numpy as np
 from measuring import append_record, benchmark_parser, seconds, spread
 from threadpoolctl import threadpool_limits
 
-from merge_sumo.analysis.truth import ground_truth
+from merge_sumo.analysis.truth import TRUTH_CASES, ground_truth
 from merge_sumo.campaigns.campaign import run_campaign
 from merge_sumo.campaigns.journal import Journal, to_line
 from merge_sumo.campaigns.loop import SearchLoop
@@ -288,7 +288,8 @@ def cases_to_most(flight: int | None, seed: int, levels: tuple[int, ...]) -> flo
         vut="design2", levels=levels, scenario=US23, cases=SEARCHED, seed=seed, in_flight=flight
     )
     plan = settings.load_plan()
-    target = 0.9 * sum(fmc(ground_truth(plan, level).failures) for level in levels)
+    truths = [ground_truth(plan, level, TRUTH_CASES[level]) for level in levels]
+    target = 0.9 * sum(fmc(truth.failures) for truth in truths)
     with tempfile.TemporaryDirectory() as scratch:
         outcomes = run_campaign(settings, plan, Path(scratch) / "run").outcomes
     for count in range(5, SEARCHED + 1, 5):

@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from merge_sumo import config
 from merge_sumo.analysis.run_study import OnPart, check_least
 from merge_sumo.analysis.sampler_study import SamplerRun, SamplerStudy, Study
+from merge_sumo.analysis.surface import nodes
 from merge_sumo.analysis.truth import TRUTH_CASES
 from merge_sumo.campaigns.settings import CampaignSettings
-from merge_sumo.drivers.policies import policies_of
 from merge_sumo.metrics.fmc import fmc
 from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.records import to_plain
@@ -29,7 +29,6 @@ from merge_sumo.samplers.registry import make_sampler
 from merge_sumo.scenario.case import FloatArray, Pool, to_unit
 from merge_sumo.scenario.scenario import LEVELS, US23
 from merge_sumo.simulation.plan import versions
-from merge_sumo.simulation.povs import Povs
 from merge_sumo.workers import Workers
 
 SAMPLERS = ("uniform", "annealing", "subset", "gpr", "coverage")
@@ -176,16 +175,15 @@ class ColumnResult:
         """Return the predictions of the surrogate of `gpr`, of one search, by number of batches."""
         searches, level = self.study.searches["gpr"], self.column.level
         seed = _median_seed(searches)
-        axis = np.linspace(0.0, 1.0, SURFACE_POINTS)
-        grid = np.stack(np.meshgrid(axis, axis), axis=-1)
+        points = nodes((SURFACE_POINTS, SURFACE_POINTS, 1))
         result = {}
         for batch in SURFACE_BATCHES:
             if batch <= len(searches[seed].fmc):
                 known = [outcome for outcome in searches[seed].outcomes if outcome.batch < batch]
                 sampler = make_sampler("gpr", Pool(levels=(level,), scenario=US23), seed)
                 sampler.tell(known)
-                margin = predicted_margin(sampler.history(level), grid.reshape(-1, 2))
-                square = margin.reshape(grid.shape[:2])
+                margin = predicted_margin(sampler.history(level), points)
+                square = margin.reshape(SURFACE_POINTS, SURFACE_POINTS)
                 result[batch] = PredictedMargins(square, _panel(known, level))
         return result
 
@@ -238,20 +236,17 @@ def reproduce(
 
     Args:
         scale: numbers of cases and seeds.
-        policies: folder of the POV networks; by default the shipped ones.
-        workers: where cases run; by default this process.
+        policies: folder of the POV networks; None for the shipped ones.
+        workers: where cases run; None for this process.
         on_part: called with the progress of each part.
 
     Raises:
         UserError: where a level has no POV.
     """
-    povs = Povs(policies=policies or policies_of(US23))
-    for level in LEVELS:
-        povs.check_level(level)
+    folder = None if policies is None else str(policies)
     studies = {}
     for vut in ("design1", "design2"):
-        folder = str(povs.policies)
-        settings = CampaignSettings(vut=vut, levels=(0,), scenario=US23, policies=folder)
+        settings = CampaignSettings(vut=vut, levels=LEVELS, scenario=US23, policies=folder)
         studies[vut] = Study(settings.load_plan(), workers or Workers(), on_part=on_part)
     columns = {}
     for column in TABLE_II:
@@ -270,7 +265,7 @@ def reproduce(
     )
     together = studies["design2"].searches(LEVELS, ADAPTIVE, options)
     levels = {name: _level_batches(searches) for name, searches in together.items()}
-    return Reproduction(scale, columns, levels, povs.sha256())
+    return Reproduction(scale, columns, levels, studies["design2"].plan.povs.sha256())
 
 
 def _median_seed(searches: Sequence[SamplerRun]) -> int:

@@ -252,8 +252,6 @@ class Study:
         Returns:
             The searches of each sampler, in the order of the seeds.
         """
-        for level in levels:
-            self.plan.povs.check_level(level)
         plan = self.plan.for_cases(options.batch or COMPARED_BATCH)
         name = title(str(plan.vut.spec), levels)
         tasks = list(product(samplers, range(options.seeds)))
@@ -376,10 +374,8 @@ class SamplerStudy(Result):
         """
         total = 0.0
         for level, truth in self.truths.items():
-            known = truth.failures
-            for search in chain.from_iterable(self.searches.values()):
-                if len(search.failures(level)):
-                    known = np.concatenate((known, search.failures(level)))
+            found = [one.failures(level) for one in chain.from_iterable(self.searches.values())]
+            known = np.concatenate([truth.failures, *filter(len, found)])
             total += max(fmc(known), fmc(self.dense.get(level, truth).failures))
         return total
 

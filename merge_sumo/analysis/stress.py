@@ -21,7 +21,7 @@ from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.records import Record
 from merge_sumo.result import Result
 from merge_sumo.scenario.case import Case
-from merge_sumo.scenario.scenario import DT_S, IMPERFECTIONS
+from merge_sumo.scenario.scenario import DT_S
 from merge_sumo.simulation.plan import SimulationPlan
 
 Index = Annotated[int, Meta(ge=0)]
@@ -68,11 +68,6 @@ class Rung(Record, frozen=True):
             fails += len(run.fails)
             without_verdict += len(run.without_verdict)
         return passes, fails, without_verdict
-
-    @property
-    def flips(self) -> int:
-        """Number of verdicts that flip, over all runs."""
-        return sum(self.counts)
 
 
 class StressResult(Result, Record, frozen=True):
@@ -123,7 +118,7 @@ class StressResult(Result, Record, frozen=True):
         Args:
             rung: the rung.
         """
-        return rung.flips / max(self.cases * len(rung.runs), 1)
+        return sum(rung.counts) / max(self.cases * len(rung.runs), 1)
 
 
 STRESS = StudyFile("stress.json", StressResult)
@@ -135,9 +130,7 @@ POWER_W_PER_KG = 34.0
 ERROR_X_M = 0.5
 ERROR_V_MPS = 2.0 / 3.6
 """Accuracy of a radar for lane changes: 50 cm and 2 km/h. Autoliv NB24G1V2, user's manual, 3.1."""
-ERRORS_BY_UNIT = {"m": ERROR_X_M, "m/s": ERROR_V_MPS}
-OF_VUT = {"v_vut0_mps", *(coordinate.field for coordinate in IMPERFECTIONS)}
-"""Coordinates of the VUT, which no rung changes."""
+START_ERRORS = {"x_pov0_m": ERROR_X_M, "v_pov0_mps": ERROR_V_MPS}
 CAR_LENGTH_M = 5.0
 DRAWS = 5
 """Number of runs of all cases where a change is drawn at random, with the seed of the case."""
@@ -192,9 +185,8 @@ def _start_off(case: Case, rng: np.random.Generator) -> Case:
     values: dict[str, Any] = {}
     for dimension in case.scenario.dimensions(case.level):
         name = dimension.field
-        most = ERRORS_BY_UNIT.get(dimension.unit, 0.0)
-        if most and name not in OF_VUT:
-            value = getattr(case, name) + rng.uniform(-most, most)
+        if name in START_ERRORS:
+            value = getattr(case, name) + rng.uniform(-START_ERRORS[name], START_ERRORS[name])
             values[name] = min(max(value, dimension.low), dimension.high)
     return replace(case, **values)
 

@@ -127,7 +127,7 @@ class Truth:
 def ground_truth(
     plan: SimulationPlan,
     level: int,
-    cases: int | None = None,
+    cases: int,
     seed: int = 0,
     *,
     workers: Workers | None = None,
@@ -142,7 +142,7 @@ def ground_truth(
     Args:
         plan: how cases run.
         level: POV level.
-        cases: number of uniform cases; None for that of the paper at the level.
+        cases: number of uniform cases.
         seed: seed of their points.
         workers: where they run; None for this process.
         cache: folder of truths; None for that of the user.
@@ -151,22 +151,20 @@ def ground_truth(
     Raises:
         UserError: where nothing can be kept in the cache, or others can write it.
     """
-    count = TRUTH_CASES[level] if cases is None else cases
-    plan.povs.check_level(level)
     plan = plan.for_verdicts()
-    known = known_truth(plan, level, count, seed, cache=cache, engines=(Engine.SUMO, plan.engine))
+    known = known_truth(plan, level, cases, seed, cache=cache, engines=(Engine.SUMO, plan.engine))
     if known is not None:
         return known
-    path = TruthKey(plan.key(level), level, count, seed, plan.engine).path(cache)
+    path = TruthKey(plan.key(level), level, cases, seed, plan.engine).path(cache)
     if not path.parent.is_dir():
         make_folder(path.parent, CACHE)
         path.parent.chmod(stat.S_IRWXU)
     check_own(path)
     check_private(path.parent)
     rng = np.random.default_rng([seed, level])
-    points = rng.random((count, len(plan.scenario.dimensions(level))))
+    points = rng.random((cases, len(plan.scenario.dimensions(level))))
     uniform = Pool(levels=(level,), scenario=plan.scenario).cases(points, level)
-    margins, in_sumo = np.full(count, np.nan), 0
+    margins, in_sumo = np.full(cases, np.nan), 0
     files = (plan.vut.files or {}) | plan.povs.files
     results = evaluate(plan.at_level(level), uniform, workers, _margin_of)
     for row, (margin, by_sumo, loaded) in enumerate(results):
