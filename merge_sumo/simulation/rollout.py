@@ -66,10 +66,10 @@ class Rollout:
 
     A corridor is refilled when its episode ends, so episodes do not end in order. An episode
     depends neither on the number of corridors nor on its neighbours. An error of the VUT ends its
-    episode as VUT_ERROR, an error of the POV as SIM_ERROR. Where an error ended the process of the
-    controllers, the running episodes begin again, one by one; an episode that ends it twice, alone,
-    is at fault. When SUMO fails, the running episodes end as SIM_ERROR, and SUMO is started again
-    for the others.
+    episode as VUT_ERROR, an error of the POV as SIM_ERROR. When the process of a controller dies,
+    the running episodes begin again, one at a time; an episode is at fault if the process dies
+    `MAX_DEATHS` times while only that episode runs. When SUMO fails, the running episodes end as
+    SIM_ERROR, and SUMO is started again for the others.
 
     A fault of a controller arrives as NaN, and `Driver.reason` says why. An exception comes only
     from a driver in this process, and `ControllerDiedError` from a process that has ended.
@@ -93,7 +93,8 @@ class Rollout:
 
         Args:
             simulation: the corridors.
-            pov: drives all C cars of the mainline of the K corridors, as the POVs of C K corridors.
+            pov: drives the C cars of the mainline of the K corridors; car c of corridor k has the
+                index c K + k.
             vut: drives the VUT of each corridor.
             cases: cases of the simulation's scenario.
         """
@@ -103,7 +104,7 @@ class Rollout:
         self.has_traffic = len(self.mainline) > 1
         self.queue = enumerate(cases)
         self.suspects: deque[tuple[int, Case]] = deque()
-        """Episodes that ran when a process of controllers died: each runs again alone."""
+        """Cases that ran when a process of controllers died: each runs again alone."""
         self.alone = False
         """Whether a suspect runs alone."""
         self.deaths = Counter[int]()
@@ -114,6 +115,7 @@ class Rollout:
         self.step = np.zeros(corridors, dtype=np.int64)
         self.clipped = np.zeros(corridors, dtype=np.int64)
         self.errors: dict[int, tuple[End, str]] = {}
+        """Faults of the drivers in this step, by corridor; `end_episodes` takes them."""
         self.raised: str | None = None
         """Error that the VUT raised instead of its last answer."""
         self.timeout_at = np.full(corridors, NEVER)
@@ -141,7 +143,7 @@ class Rollout:
             self.row += 1
             try:
                 simulation.advance()
-                acceleration = self.ask_drivers()
+                acceleration = self.limited(self.ask_drivers())
                 merged = None
                 if self.merging is not None:
                     merged = self.merging.step(simulation.x_m, simulation.v_mps)
@@ -200,7 +202,14 @@ class Rollout:
         self.follows_up[corridor] = True
 
     def begin_again(self, lost: ControllerDiedError) -> None:
-        """Let the running episodes begin again, one by one; end the one at fault, if any."""
+        """Let the running episodes begin again, one at a time; end the one at fault, if any.
+
+        Until the last of these suspects has ended, `alone` is true, and `next_case` gives suspects
+        instead of new cases. An episode at fault explains every death before.
+
+        Args:
+            lost: the death of the process of a controller.
+        """
         is_alone = np.count_nonzero(self.active) == 1
         for corridor, episode in enumerate(self.episodes):
             if episode is None:
@@ -268,15 +277,19 @@ class Rollout:
             self.errors[corridor] = End.VUT_ERROR, said
 
     def ask_drivers(self) -> FloatArray:
-        """Return the accelerations of all vehicles, (A, K), within limits; write the record."""
-        x_m, v_mps, scenario = self.simulation.x_m, self.simulation.v_mps, self.simulation.scenario
+        """Return the answers of the drivers of all vehicles, (A, K), finite, in m/s2.
+
+        Faults of drivers are noted in `errors`, and answered with 0.
+        """
+        simulation = self.simulation
+        x_m, v_mps = simulation.x_m, simulation.v_mps
         merged = x_m[VUT] >= 0.0 if self.follow_steps else None
         if self.merging is not None:
             merged = self.merging.merged
         scene = Scene(self.active, self.step, x_m, v_mps, merged=merged)
-        cars = self.pov.act(scene.of_mainline()).reshape(-1, x_m.shape[1])
+        cars = self.pov.act(scene.of_mainline()).reshape(-1, simulation.corridors)
         if self.has_traffic:
-            scene = scene._replace(conflicting=conflicting_car(x_m, v_mps, scenario))
+            scene = scene._replace(conflicting=conflicting_car(x_m, v_mps, simulation.scenario))
         self.raised = None
         try:
             of_vut = np.asarray(self.vut.act(scene), dtype=np.float64)
@@ -285,15 +298,25 @@ class Rollout:
             raise
         except ANY_FAULT as error:
             self.raised = f"{type(error).__name__}: {error}"
-            of_vut = np.full(self.simulation.corridors, np.nan)
+            of_vut = np.full(simulation.corridors, np.nan)
         answer = np.concatenate((cars[:VUT], of_vut[None], cars[VUT:]))
-        # Before the limits of car following, which would turn an infinite answer into a number.
-        if not np.isfinite(answer).all():
-            answer = self.note_faults(answer)
+        # Here, because the limits of car following turn an infinite answer into a number.
+        return answer if np.isfinite(answer).all() else self.note_faults(answer)
+
+    def limited(self, answer: FloatArray) -> FloatArray:
+        """Return the accelerations of all vehicles, (A, K), and write them into the record.
+
+        They keep the limits of car following, of the acceleration lane and of the scenario.
+
+        Args:
+            answer: answers of the drivers, (A, K), in m/s2; changed in place.
+        """
+        simulation, scenario = self.simulation, self.simulation.scenario
         if self.has_traffic:
-            keep_safe(answer, x_m, v_mps, scenario)
+            keep_safe(answer, simulation.x_m, simulation.v_mps, scenario)
         if self.merging is not None:
-            self.merging.take(self.vut.merge_requests(), answer, x_m, v_mps)
+            requests = self.vut.merge_requests()
+            self.merging.take(requests, answer, simulation.x_m, simulation.v_mps)
         acceleration: FloatArray = answer.clip(scenario.a_min_mps2, scenario.a_max_mps2)
         acceleration *= self.active
         self.now[..., 2] = acceleration.T
@@ -313,9 +336,9 @@ class Rollout:
                 episode.left.append((self.row - 1 - episode.first_row, left))
 
     def note_faults(self, answer: FloatArray) -> FloatArray:
-        """Return answers, (A, K), with 0 for those that are not finite; note the errors.
+        """Return answers, (A, K), with 0 for those that are not finite; note these in `errors`.
 
-        The answers of a VUT that is driven for do not count.
+        Where `Merging` drives instead of the VUT, the answer of the VUT is ignored.
         """
         finite = np.isfinite(answer)
         wrong = ~finite & self.active
