@@ -106,7 +106,14 @@ R = TypeVar("R")
 
 
 def verb(config: Callable[P, C]) -> Callable[[Callable[[C], R]], Callable[P, R]]:
-    """Return a decorator of a function of a config, which then takes the fields of that."""
+    """Return a decorator of a function of a config, which then takes the fields of that.
+
+    Args:
+        config: dataclass of the fields
+
+    Returns:
+        The decorator; the function that it makes shows the fields and their docstrings in `help`.
+    """
 
     def decorated(work: Callable[[C], R]) -> Callable[P, R]:
         def call(*args: P.args, **kwargs: P.kwargs) -> R:
@@ -179,7 +186,14 @@ def resume(config: c.Resume) -> CampaignRun:
 
 
 def open_run(folder: c.AnyPath) -> CampaignRun:
-    """Open the folder of a campaign; `UserError` when it is none."""
+    """Open the folder of a campaign.
+
+    Args:
+        folder: the folder
+
+    Raises:
+        UserError: it is not the folder of a campaign.
+    """
     return CampaignRun(folder)
 
 
@@ -273,7 +287,11 @@ def export(config: c.Export) -> list[Path]:
 
 
 def report(run: c.AnyRun) -> Shown:
-    """Write the report of a campaign again, and return its facts; as `merge-sumo report`."""
+    """Write the report of a campaign again, and return its facts; as `merge-sumo report`.
+
+    Args:
+        run: the campaign, or its folder.
+    """
     opened_run = campaign_of(run)
     path = str(opened_run.report())
     return Shown({"report": path, "facts": to_plain(opened_run.facts)}, [path])
@@ -525,7 +543,11 @@ def opened_truths(
 
 
 def path_of(path: Path | str | None) -> Path | None:
-    """Return a path of a user as one of `pathlib`."""
+    """Return a path of a user as one of `pathlib`.
+
+    Args:
+        path: the path; None stands for no path.
+    """
     return None if path is None else Path(path)
 
 

@@ -45,6 +45,11 @@ class Table(list[dict[str, Any]]):
     """Rows of cases, as in `outcomes.jsonl`: a list that `pandas.DataFrame` takes as it is."""
 
     def __init__(self, outcomes: Iterable[Outcome]) -> None:
+        """Make the rows of outcomes.
+
+        Args:
+            outcomes: outcomes of one scenario.
+        """
         rows = list(outcomes)
         super().__init__(outcome.to_record() for outcome in rows)
         scenario = rows[0].case.scenario if rows else US23
@@ -79,6 +84,15 @@ class CampaignRun(Result):
     """
 
     def __init__(self, folder: Path | str | RecordedCampaign, gates: Iterable[str] = ()) -> None:
+        """Read the folder of a campaign.
+
+        Args:
+            folder: the folder, or the campaign that was read from it.
+            gates: names of gates, as after `--gate`.
+
+        Raises:
+            UserError: the folder is not that of a campaign, or a gate is unknown.
+        """
         self.recorded = (
             folder if isinstance(folder, RecordedCampaign) else RecordedCampaign(Path(folder))
         )
@@ -156,7 +170,14 @@ class CampaignRun(Result):
         return self.recorded.converged
 
     def trajectory(self, index: int) -> Trajectory:
-        """Return the motion of a case; `UserError` for an index without a case."""
+        """Return the motion of a case.
+
+        Args:
+            index: index of the case.
+
+        Raises:
+            UserError: the campaign has no such case, or its motion cannot be read.
+        """
         return self.recorded.trajectory(index)
 
     @property
@@ -248,6 +269,12 @@ class CaseRun(Result):
     """One case that was run; its table begins `from_s` before its first conflict."""
 
     def __init__(self, episode: Episode, from_s: float | None = None) -> None:
+        """Take an episode that has ended.
+
+        Args:
+            episode: the episode.
+            from_s: where its table begins, before the first conflict, in s; None for the start.
+        """
         self.outcome, self.trajectory = episode.outcome, episode.trajectory
         self._from_s = from_s
 
@@ -289,17 +316,35 @@ class CaseRun(Result):
 
 
 def campaign_of(run: AnyRun) -> CampaignRun:
-    """Open a campaign of a user."""
+    """Open a campaign.
+
+    Args:
+        run: the campaign, or its folder.
+
+    Raises:
+        UserError: the folder is not that of a campaign.
+    """
     return run if isinstance(run, CampaignRun) else CampaignRun(folder_of(run))
 
 
 def open_recorded(run: AnyRun) -> RecordedCampaign:
-    """Open a campaign, or a cases file."""
+    """Open a campaign, or a cases file.
+
+    Args:
+        run: the campaign, its folder, or a cases file.
+
+    Raises:
+        UserError: it is neither of them.
+    """
     path = folder_of(run)
     is_file = not path.is_dir() and (path.suffix == SUFFIX or path.exists())
     return CasesFile(path) if is_file else campaign_of(run).recorded
 
 
 def folder_of(run: AnyRun) -> Path:
-    """Return the folder of a campaign of a user."""
+    """Return the folder of a campaign.
+
+    Args:
+        run: the campaign, or its folder.
+    """
     return Path(run) if isinstance(run, str | Path) else run.folder

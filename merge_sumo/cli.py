@@ -62,9 +62,6 @@ GROUPS: Mapping[type[Any], Group] = {
 FIELDS: Mapping[str, Parameter] = {
     "progress": Parameter(negative=("--quiet", "-q")),
     "workers": Parameter(show_default=False),
-    # Edges of nets of OpenDRIVE and OSM begin with a hyphen.
-    "mainline": Parameter(allow_leading_hyphen=True),
-    "ramp": Parameter(allow_leading_hyphen=True),
 }
 """What else an option is, by the name of its field."""
 SEARCH, LOOK, CHANGE, OWN, RESEARCH = map(
@@ -83,7 +80,11 @@ class Commands(App):
     """An application whose commands take the fields of a dataclass as arguments and options."""
 
     def assemble_argument_collection(self, **how: Any) -> ArgumentCollection:
-        """Return the arguments of a command, in groups."""
+        """Return the arguments of a command, in groups.
+
+        Args:
+            **how: as of cyclopts.
+        """
         arguments = super().assemble_argument_collection(**how)
         index = 0
         for argument in arguments:
@@ -95,7 +96,7 @@ class Commands(App):
                 continue
             default = argument.field_info.default
             shown = type(default) in (int, float) or (isinstance(default, str) and default != "")
-            # Edges of a net, and conditions, may begin with a hyphen.
+            # Conditions may begin with a hyphen, and so may edges of nets of OpenDRIVE and OSM.
             more = Parameter(show_default=shown, allow_leading_hyphen=bool(argument.keys))
             more = Parameter.combine(more, FIELDS.get(name))
             if name == "sampler":  # installed packages add some
@@ -408,6 +409,9 @@ def _check_working_folder() -> None:
 
 def execute(words: Sequence[str]) -> int:
     """Run a command and return its exit code.
+
+    Args:
+        words: the arguments of the command line.
 
     Raises:
         UserError: for bad use.

@@ -656,12 +656,22 @@ class Reproduce(Execution, Policies):
 
 
 def values_of(config: object, kind: type[Any]) -> dict[str, Any]:
-    """Return the fields of a config that a base class of it declares or inherits."""
+    """Return fields of a config by name.
+
+    Args:
+        config: the config.
+        kind: the base class whose fields are returned.
+    """
     return {one.name: getattr(config, one.name) for one in fields(kind)}
 
 
 def non_defaults(config: object, kind: type[Any]) -> dict[str, Any]:
-    """Return the same, of the fields that differ from their defaults."""
+    """Return fields of a config that differ from their defaults, by name.
+
+    Args:
+        config: the config.
+        kind: the base class whose fields are returned.
+    """
     found = values_of(config, kind)
     for field in fields(kind):
         if found[field.name] == field.default:

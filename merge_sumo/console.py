@@ -44,7 +44,11 @@ FLAGS: Mapping[str, str] = {
 
 
 def flag_of(name: str) -> str:
-    """Return the option of the command line for a field."""
+    """Return the option of the command line for a field.
+
+    Args:
+        name: name of the field.
+    """
     return FLAGS.get(name, f"--{name.replace('_', '-')}")
 
 
@@ -66,6 +70,9 @@ def prepare_streams() -> None:
 def show(line: object) -> None:
     """Print a line of a result on standard output.
 
+    Args:
+        line: the line.
+
     Raises:
         UserError: it cannot be written, and the result is lost.
         Stopped: the reader has gone: the command ends as other programs do.
@@ -81,7 +88,11 @@ def show(line: object) -> None:
 
 
 def say(line: str) -> None:
-    """Print a line for the user on standard error; one that cannot be written is lost alone."""
+    """Print a line for the user on standard error; a line that cannot be written is lost.
+
+    Args:
+        line: the line; a field in backticks becomes its option.
+    """
     with suppress(OSError):
         print(printable(_with_flags(line)), file=sys.stderr, flush=True)
 
@@ -104,7 +115,11 @@ def _with_flags(sentence: str) -> str:
 
 
 def print_json(record: dict[str, Any]) -> None:
-    """Print a JSON object in one line."""
+    """Print a JSON object in one line.
+
+    Args:
+        record: the object.
+    """
     show(json.dumps(record, allow_nan=False))
 
 

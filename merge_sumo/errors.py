@@ -14,7 +14,11 @@ class UserError(Exception):
     """Bad input or a missing part of the installation; the command line prints it and exits 2."""
 
     def __init__(self, sentence: str) -> None:
-        """Take the sentence; messages of libraries that are part of it may have several lines."""
+        """Join the lines of a sentence.
+
+        Args:
+            sentence: what is wrong and what to do; it may quote several lines of a library.
+        """
         super().__init__(" ".join(sentence[:MOST_CHARACTERS].splitlines()))
 
     def _render_traceback_(self) -> list[str]:
@@ -35,7 +39,12 @@ class Notice(UserWarning):
 
 
 def notice(sentence: str, category: type[Warning] = Notice) -> None:
-    """Warn whoever called the package, however many calls above."""
+    """Warn the caller of the package, however many calls above.
+
+    Args:
+        sentence: the warning.
+        category: its type.
+    """
     frame: FrameType | None = sys._getframe(1)
     level = 2
     while frame is not None and frame.f_globals.get("__name__", "").startswith("merge_sumo."):

@@ -45,14 +45,29 @@ class TakenError(UserError):
 
 
 def regular(path: Path) -> Path:
-    """Return the path of a file to read; OSError where it is a folder, a pipe or a device."""
+    """Return the path of a file to read.
+
+    Args:
+        path: the path; nothing may be there.
+
+    Raises:
+        OSError: it is a folder, a pipe or a device.
+    """
     if path.exists() and not path.is_file():
         raise OSError(errno.EINVAL, "it is not a file", str(path))
     return path
 
 
 def read_limited(path: Path, most_bytes: int) -> bytes:
-    """Return the bytes of a regular file; OSError where it is not one, or larger."""
+    """Return the bytes of a regular file.
+
+    Args:
+        path: the file.
+        most_bytes: maximum size.
+
+    Raises:
+        OSError: it is not a regular file, or larger.
+    """
     with regular(path).open("rb") as file:
         content = file.read(most_bytes + 1)
     if len(content) > most_bytes:
@@ -98,6 +113,9 @@ def check_own(*paths: Path) -> None:
 
     To be called before a file is written again: in a received folder, a link leads anywhere, and a
     pipe never answers.
+
+    Args:
+        paths: files and folders of merge-sumo, which may not exist.
     """
     for path in paths:
         try:
@@ -196,7 +214,12 @@ def _holds(path: Path, files: Mapping[str, bytes]) -> bool:
 def new_file(path: Path, option: str = "`out`") -> Iterator[BinaryIO]:
     """Give a new file to write; it is at `path` in the end, or nowhere.
 
-    Raises `UserError` where something is at `path` or it cannot be written.
+    Args:
+        path: the file.
+        option: what names it in the message.
+
+    Raises:
+        UserError: something is there, or it cannot be written.
     """
     try:
         if os.path.lexists(path):
@@ -275,7 +298,11 @@ def _sync(file: BinaryIO, content: bytes) -> None:
 
 
 def sync_folder(folder: Path) -> None:
-    """Sync the entries of a folder to the disk, so that a new file is found after a crash."""
+    """Sync the entries of a folder to the disk, so that a new file is found after a crash.
+
+    Args:
+        folder: the folder.
+    """
     if sys.platform == "win32":  # folders cannot be opened there
         return
     descriptor = os.open(folder, os.O_RDONLY)
@@ -286,7 +313,11 @@ def sync_folder(folder: Path) -> None:
 
 
 def free(path: Path) -> Path:
-    """Return a path, with a number at the end of its stem where something is there."""
+    """Return a path, with a number at the end of its stem where something is there.
+
+    Args:
+        path: the path.
+    """
     candidate, number = path, count(2)
     while os.path.lexists(candidate):
         candidate = path.with_stem(f"{path.stem}-{next(number)}")
@@ -297,6 +328,9 @@ def dated(what: str) -> Path:
     """Return a dated name below `runs/`, of which `what` becomes a part.
 
     It has microseconds: several campaigns of a VUT may begin in the same second.
+
+    Args:
+        what: a name, such as that of the VUT.
     """
     name = re.sub(r"[^\w.-]+", "-", what, flags=re.ASCII).strip("-.")[-100:]
     return DEFAULT / f"{name}-{datetime.now().astimezone():%Y%m%d-%H%M%S-%f}"
@@ -306,6 +340,9 @@ def link_latest(folder: Path) -> None:
     """Let `runs/latest` lead to a folder that has its name from `dated`.
 
     Only a link to such a folder is replaced; where links cannot be made nothing happens.
+
+    Args:
+        folder: the folder of a campaign.
     """
     if folder.parent != DEFAULT or not DATED.fullmatch(folder.name) or not folder.is_dir():
         return
@@ -319,7 +356,12 @@ def link_latest(folder: Path) -> None:
 
 
 def cannot_write(path: Path, error: OSError) -> UserError:
-    """Return the error for a path that cannot be written."""
+    """Return the error for a path that cannot be written.
+
+    Args:
+        path: the path.
+        error: why it cannot be written.
+    """
     return UserError(f"cannot write {path}: {error.strerror or error}")
 
 
@@ -332,7 +374,11 @@ Files = dict[str, str | None]
 
 
 def hashed(paths: Iterable[Path]) -> Files:
-    """Return files with their hashes."""
+    """Return files with their hashes.
+
+    Args:
+        paths: the files.
+    """
     folder = Path.cwd().resolve()
     files: Files = {}
     for path in sorted({path.resolve() for path in paths}):
@@ -361,7 +407,11 @@ def files_now(recorded: Files, loaded: Files) -> Files:
 
 
 def sha256_of(path: Path) -> str | None:
-    """Return the SHA-256 of a regular file; None where there is none that can be read."""
+    """Return the SHA-256 of a regular file; None where it cannot be read.
+
+    Args:
+        path: the file.
+    """
     try:
         found = path.stat()
         if not stat.S_ISREG(found.st_mode):
@@ -379,7 +429,14 @@ def _sha256(path: Path, _inode: int, _changed_ns: int, _size: int) -> str:
 
 
 def check_code(path: Path) -> None:
-    """Raise `UserError` where users other than this one and root may write a file of code."""
+    """Refuse code that users other than this one and root may write.
+
+    Args:
+        path: the file of code.
+
+    Raises:
+        UserError: others may write it.
+    """
     if why := _written_by_others(path, 0):
         raise UserError(
             f"{printable(str(path))} is not run: {why}; make it yours alone (`chmod go-w "
@@ -388,7 +445,14 @@ def check_code(path: Path) -> None:
 
 
 def check_private(folder: Path) -> None:
-    """Raise `UserError` where a cache folder is not this user's, or others can write it."""
+    """Refuse a cache folder that is not this user's, or that others can write.
+
+    Args:
+        folder: the folder.
+
+    Raises:
+        UserError: others may write it.
+    """
     if why := _written_by_others(folder):
         raise UserError(
             f"the cache folder {folder} is not used: {why}, and could forge what it holds; run "
@@ -410,9 +474,12 @@ def _written_by_others(path: Path, *trusted: int) -> str | None:
 
 
 def resource(name: str) -> Path:
-    """Return the shipped folder `name` ("sumo_net" or "policies").
+    """Return a shipped folder.
 
     A wheel carries the folders inside the package; a source tree has them next to it.
+
+    Args:
+        name: "sumo_net" or "policies".
     """
     package = Path(__file__).resolve().parent
     shipped = package / "shipped" / name

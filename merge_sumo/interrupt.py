@@ -26,6 +26,11 @@ class Stopped(BaseException):
     """A signal asked to stop. Not an `Exception`: no VUT that swallows errors swallows this."""
 
     def __init__(self, number: int) -> None:
+        """Take the signal.
+
+        Args:
+            number: number of the signal.
+        """
         super().__init__(signal.Signals(number).name)
         self.number = number
 
@@ -42,7 +47,11 @@ class Interrupt:
     """
 
     def __init__(self, note: str) -> None:
-        """`note` is printed at the first signal."""
+        """Prepare to note signals.
+
+        Args:
+            note: what is printed at the first signal.
+        """
         self._note = f"\n{note}\n".encode()
         self._number: int | None = None
         self._before: list[Any] = []

@@ -37,7 +37,11 @@ def check_limits() -> None:
 
 
 def lower_limits(**most: int) -> None:
-    """Let something run out in this process before it runs out for everybody: `RLIMIT_DATA=...`."""
+    """Let something run out in this process before it runs out for all others.
+
+    Args:
+        most: the limit by its name, as `RLIMIT_DATA`.
+    """
     with suppress(ImportError):  # Windows
         import resource
 
@@ -47,7 +51,11 @@ def lower_limits(**most: int) -> None:
 
 
 def exhausted(error: BaseException) -> str | None:
-    """Return advice on an error of the system that is not a fault of the program, or None."""
+    """Return advice on an error of the system that is not a fault of the program, or None.
+
+    Args:
+        error: any error.
+    """
     if isinstance(error, OSError) and error.errno in EXHAUSTED:
         where = f"{error.filename}: " if isinstance(error.filename, str) else ""
         return where + EXHAUSTED[error.errno]

@@ -11,7 +11,11 @@ from unicodedata import category
 
 
 def printable(text: str) -> str:
-    """Return a text with control characters, line ends and invalid characters escaped."""
+    """Return a text with control characters, line ends and invalid characters escaped.
+
+    Args:
+        text: any text.
+    """
     return "".join(
         letter
         if letter.isprintable() or category(letter) == "Zs"
@@ -21,12 +25,21 @@ def printable(text: str) -> str:
 
 
 def sentence(text: str) -> str:
-    """Return a text with a capital letter and a full stop."""
+    """Return a text with a capital letter and a full stop.
+
+    Args:
+        text: a text that is not empty.
+    """
     return f"{text[0].upper()}{text[1:].removesuffix('.')}."
 
 
 def counted(number: int, what: str) -> str:
-    """Return a number of things in words."""
+    """Return a number of things in words: 1 case, 2 cases.
+
+    Args:
+        number: the number.
+        what: the thing in the singular.
+    """
     return f"{number} {what}" if number == 1 else f"{number} {what}s"
 
 
@@ -34,6 +47,9 @@ def quoted(argument: str | Path) -> str:
     """Return an argument of a command to paste into a shell.
 
     What cannot be printed is written as bytes in `$'...'`, which bash, zsh and ksh read.
+
+    Args:
+        argument: the argument.
     """
     text = str(argument)
     if text.isprintable():
@@ -64,7 +80,11 @@ def nearest(name: str, known: Iterable[str], alike: float = 0.6) -> list[str]:
 
 
 def either(names: Iterable[str]) -> str:
-    """Return names in words: a, b or c."""
+    """Return names in words: a, b or c.
+
+    Args:
+        names: one or more names.
+    """
     ordered = list(names)
     return ordered[0] if len(ordered) == 1 else f"{', '.join(ordered[:-1])} or {ordered[-1]}"
 

@@ -70,12 +70,25 @@ class Record(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def record_type(name: str, fields: Sequence[tuple[Any, ...]]) -> Any:
-    """Return a type of records with fields that are known at run time: (name, type[, default])."""
+    """Return a type of records with fields that are known at run time.
+
+    Args:
+        name: name of the type.
+        fields: of each field: name, type, and its default, if it has one.
+    """
     return msgspec.defstruct(name, fields, bases=(Record,), frozen=True, forbid_unknown_fields=True)
 
 
 def decode(content: bytes | str, kind: Any = Any) -> Any:
-    """Return JSON as a value of a type; `RecordError` where it is not one."""
+    """Return JSON as a value of a type.
+
+    Args:
+        content: the JSON.
+        kind: the type.
+
+    Raises:
+        RecordError: it is not JSON, or not of the type.
+    """
     try:
         return msgspec.json.decode(content, type=kind)
     except msgspec.ValidationError as error:
@@ -90,7 +103,12 @@ def decode(content: bytes | str, kind: Any = Any) -> Any:
 def read_record(path: Path, kind: type[T]) -> T | None:
     """Return a JSON file as a value of a type; None without the file.
 
-    Raises `UserError` for a file that is not as it was written.
+    Args:
+        path: the file.
+        kind: the type.
+
+    Raises:
+        UserError: the file is not as it was written.
     """
     try:
         known: T = decode(read_limited(path, MAX_RECORD_BYTES), kind)
@@ -137,7 +155,13 @@ def _check_names(record: object, kind: Any) -> None:
 def check_fields(value: Any) -> None:
     """Check and convert the fields of a dataclass in place: 18 to 18.0, a list to a tuple.
 
-    Numbers of numpy are as good as those of Python. Raises `RecordError` for another type.
+    Numbers of numpy are as good as those of Python.
+
+    Args:
+        value: the dataclass.
+
+    Raises:
+        RecordError: a field is of another type.
     """
     kind: Any = type(value)
     for name, hint in _hints(kind).items():
@@ -185,9 +209,14 @@ def read_indexed(path: Path, kind: type[T], indices: Container[int]) -> list[T]:
 
 
 def read_toml(path: Path, what: str) -> tuple[str, dict[str, Any]]:
-    """Return the text of a TOML file, and its record; `what` it holds stands in the sentences.
+    """Return the text of a TOML file, and its record.
 
-    Raises `UserError` where it cannot be read or is not TOML.
+    Args:
+        path: the file.
+        what: what it holds, for messages.
+
+    Raises:
+        UserError: it cannot be read, or is not TOML.
     """
     try:
         text = read_limited(path, MAX_TOML_BYTES).decode()
@@ -202,14 +231,26 @@ def read_toml(path: Path, what: str) -> tuple[str, dict[str, Any]]:
 
 
 def check_toml_size(content: bytes, path: Path) -> None:
-    """Raise `UserError` where a file of this content is one that `read_toml` refuses."""
+    """Refuse a file that `read_toml` would refuse.
+
+    Args:
+        content: its bytes.
+        path: its path.
+
+    Raises:
+        UserError: it is too large.
+    """
     if len(content) > MAX_TOML_BYTES:
         size = f"{MAX_TOML_BYTES // 2**20} MiB"
         raise UserError(f"cannot write {path}: it is larger than {size}; name fewer cases")
 
 
 def toml_value(value: object) -> str:
-    """Return plain values as TOML has them, in a line, numbers in full."""
+    """Return a plain value as TOML in one line, numbers in full.
+
+    Args:
+        value: numbers, texts, lists and tables.
+    """
     if isinstance(value, dict):
         named = []
         for name, of in value.items():
@@ -222,22 +263,43 @@ def toml_value(value: object) -> str:
 
 
 def to_plain(value: object) -> Any:
-    """Return a value as the lists and tables that JSON has; a number of numpy is one of Python."""
+    """Return a value as the lists and tables of JSON, numbers of numpy as those of Python.
+
+    Args:
+        value: a value with records and dataclasses.
+    """
     return msgspec.to_builtins(value, enc_hook=methodcaller("item"))
 
 
 def to_json(value: object, *, indent: int | None = None) -> bytes:
-    """Return a value as JSON, with its line end; `ValueError` for a number that is not finite."""
+    """Return a value as JSON, with its line end.
+
+    Args:
+        value: the value, as of `to_plain`.
+        indent: spaces of each level; None for one line.
+
+    Raises:
+        ValueError: a number is not finite.
+    """
     return (json.dumps(to_plain(value), indent=indent, allow_nan=False) + "\n").encode()
 
 
 def replaced(value: T, **changes: Any) -> T:
-    """Return a record with other values in some fields."""
+    """Return a record with other values in some fields.
+
+    Args:
+        value: the record.
+        changes: other values by field.
+    """
     return msgspec.structs.replace(value, **changes)  # type: ignore[type-var]
 
 
 def in_words(hint: Any) -> str:
-    """Return the values of a type in words, for "it must be ..."."""
+    """Return the values of a type in words, for "it must be ...".
+
+    Args:
+        hint: the type, with its limits.
+    """
     origin, parts = get_origin(hint), get_args(hint)
     if origin is Annotated:
         meta: Meta = parts[1]
@@ -302,9 +364,13 @@ def _not_a_value(name: str, value: object, hint: Any, message: str) -> str:
 
 
 def read_arrays(file: Path | io.BytesIO, *names: str) -> dict[str, NDArray[Any]]:
-    """Return the arrays of an .npz file of ours, or those that are named.
+    """Return the arrays of an .npz file of merge-sumo, by name.
 
-    Ours are not compressed, so that no file is more than it looks.
+    These files are not compressed, so that none is more than it looks.
+
+    Args:
+        file: the file.
+        names: the arrays to read; by default all.
 
     Raises:
         RecordError: the file is missing, or is not such a file.

@@ -112,6 +112,9 @@ def entries_of(group: str) -> dict[str, dict[str, EntryPoint]]:
     """Return the installed entry points of a group, by name and then by package.
 
     Nothing is imported. The working folder, which may be received, is not searched.
+
+    Args:
+        group: the group.
     """
     try:
         return _installed(group, tuple(sys.path), Path.cwd().resolve())

@@ -13,7 +13,11 @@ from merge_sumo.records import to_plain
 
 @singledispatch
 def lines_of(result: Result) -> list[str]:
-    """Return the lines of a result, as `reports/text.py` writes them for each study."""
+    """Return the lines of a result, as `reports/text.py` writes them for each study.
+
+    Args:
+        result: the result.
+    """
     raise TypeError(f"{type(result).__name__} has no lines")
 
 

@@ -69,17 +69,25 @@ def forget_safe_path() -> None:
 
 
 def python_command(main: str, settings: Mapping[str, Any]) -> list[str]:
-    """Return a command that calls `main`, "MODULE:FUNCTION", with settings in a new interpreter.
+    """Return a command that calls a function with settings in a new interpreter.
 
     It imports modules from where this process does and from nowhere else; the settings travel as
     JSON.
+
+    Args:
+        main: the function, "MODULE:FUNCTION".
+        settings: its argument, as JSON has it.
     """
     told = {**settings, "main": main, "path": sys.path}
     return [sys.executable, "-P", "-c", BOOT, json.dumps(told)]
 
 
 def named(name: str) -> Any:
-    """Return the object "MODULE:NAME"."""
+    """Return an object by its name.
+
+    Args:
+        name: "MODULE:NAME".
+    """
     module, _, attribute = name.partition(":")
     return getattr(importlib.import_module(module), attribute)
 
@@ -88,6 +96,9 @@ def end_with(lifeline: int) -> None:
     """Have the system end this process when the other end of a pipe is closed.
 
     By a signal and not by a thread: native code that never returns would hold a thread up.
+
+    Args:
+        lifeline: file descriptor of this end of the pipe.
     """
     import fcntl
 

@@ -45,13 +45,27 @@ class SerialExecutor(Executor):
     """Runs everything in this process, as it is submitted."""
 
     def submit(self, function: Callable[..., R], /, *args: Any, **kwargs: Any) -> Future[R]:
-        """Run a function now; its exceptions are raised by this call."""
+        """Run a function now.
+
+        Args:
+            function: the function; its exceptions are raised by this call.
+            args: its arguments.
+            kwargs: its keywords.
+
+        Returns:
+            A future with its result.
+        """
         future: Future[R] = Future()
         future.set_result(function(*args, **kwargs))
         return future
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """Release what this process kept from one chunk to the next."""
+        """Release what this process kept from one chunk to the next.
+
+        Args:
+            wait: without effect.
+            cancel_futures: without effect.
+        """
         end_worker()
 
 
@@ -110,7 +124,11 @@ class Workers(AbstractContextManager["Workers"]):
         self.on_close = ExitStack()
 
     def chunk_size(self, items: int) -> int:
-        """Return the number of items that a worker takes at a time."""
+        """Return the number of items that a worker takes at a time.
+
+        Args:
+            items: number of all items.
+        """
         return max(1, min(MAX_CHUNK, math.ceil(items / self.count)))
 
     def submit(
@@ -152,6 +170,9 @@ class Workers(AbstractContextManager["Workers"]):
 
     def collect(self, job: Job[T, R]) -> list[R]:
         """Return the results of all items of a job, in their order.
+
+        Args:
+            job: what `submit` has returned.
 
         Raises:
             WorkersLostError: no worker can be reached.
@@ -229,7 +250,11 @@ AnyWorkers = int | str | None
 def number_of_workers(requested: AnyWorkers) -> int:
     """Return a number of worker processes; one for each core for "auto" and None.
 
-    Raises `UserError` for another value.
+    Args:
+        requested: the number, "auto" or None.
+
+    Raises:
+        UserError: it is another value.
     """
     if requested in (None, AUTO):
         return os.cpu_count() or 1
@@ -263,7 +288,14 @@ def open_workers(workers: AnyWorkers = AUTO) -> Workers:
 
 
 def dask_workers(address: str) -> Workers:
-    """Return the workers of a running Dask cluster; `UserError` when there are none."""
+    """Return the workers of a running Dask cluster.
+
+    Args:
+        address: address of its scheduler, tcp://HOST:PORT.
+
+    Raises:
+        UserError: Dask is missing, or the cluster has no workers.
+    """
     if "://" not in address:
         raise UserError(
             f"workers is {address!r}: give a number of processes, or the address of a Dask "
@@ -308,7 +340,11 @@ class LocalProcesses(ProcessPoolExecutor):
     """
 
     def __init__(self, workers: int) -> None:
-        """Start them."""
+        """Start the processes.
+
+        Args:
+            workers: their number.
+        """
         # A worker that is killed leaves its temporary files behind.
         self._scratch = ScratchFolder()
         with without_cwd():  # its locks have a process of their own
@@ -318,7 +354,12 @@ class LocalProcesses(ProcessPoolExecutor):
             self.submit(int)  # with the first task they start
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """Let the workers end, or without `wait` kill them; remove their temporary files."""
+        """Let the workers end, or without `wait` kill them; remove their temporary files.
+
+        Args:
+            wait: whether their work ends first.
+            cancel_futures: without effect: what has not begun is dropped.
+        """
         if not wait:
             for process in list((self._processes or {}).values()):
                 process.kill()
@@ -330,7 +371,11 @@ _endings: list[Callable[[], None]] = []
 
 
 def when_worker_ends(ending: Callable[[], None]) -> None:
-    """Have something called when the work of this process as a worker is over."""
+    """Have a function called when the work of this process as a worker is over.
+
+    Args:
+        ending: the function.
+    """
     if ending not in _endings:
         _endings.append(ending)
 

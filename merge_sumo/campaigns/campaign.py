@@ -218,7 +218,11 @@ def controller_model_of(plan: SimulationPlan, pool: Pool, seed: int) -> Controll
 
 
 def case_name(index: int) -> str:
-    """Return the name of a case's folder."""
+    """Return the name of a case's folder.
+
+    Args:
+        index: index of the case.
+    """
     return f"case-{index:05d}"
 
 

@@ -103,7 +103,11 @@ class RecordedCampaign:
     """
 
     def __init__(self, folder: Path) -> None:
-        """Read settings and outcomes."""
+        """Read settings and outcomes.
+
+        Args:
+            folder: the folder.
+        """
         self._take(folder, read_settings(folder), folder / SETTINGS)
         self.criterion = Criterion(self.settings.fail_when, self.settings.require)
         self._read()
@@ -198,7 +202,14 @@ class RecordedCampaign:
         )
 
     def outcome(self, index: int) -> Outcome:
-        """Return the outcome of a case; `UserError` when the campaign has no such case."""
+        """Return the outcome of a case.
+
+        Args:
+            index: index of the case.
+
+        Raises:
+            UserError: the campaign has no such case.
+        """
         if not 0 <= index < len(self.outcomes):
             raise UserError(
                 f"{self.folder} has no case {index}: it has cases 0 to {len(self.outcomes) - 1}"
@@ -207,6 +218,9 @@ class RecordedCampaign:
 
     def trajectory(self, index: int) -> Trajectory:
         """Return the trajectory of a case.
+
+        Args:
+            index: index of the case.
 
         Raises:
             NoTrajectoryError: it is missing or unreadable.
@@ -230,7 +244,14 @@ class RecordedCampaign:
         )
 
     def trajectories(self, indices: Iterable[int]) -> dict[int, Trajectory]:
-        """Return the trajectories of cases by index without those that are lost; see above."""
+        """Return the trajectories of cases by index, without those that are lost.
+
+        Args:
+            indices: indices of cases.
+
+        Raises:
+            UserError: as of `trajectory`.
+        """
         known = {}
         for index in indices:
             with suppress(NoTrajectoryError):
@@ -311,7 +332,14 @@ class RecordedCampaign:
 
 
 def read_settings(folder: Path) -> dict[str, Any]:
-    """Return the content of `campaign.json`; `UserError` where it is not that of a campaign."""
+    """Return the content of `campaign.json`.
+
+    Args:
+        folder: folder of a campaign.
+
+    Raises:
+        UserError: it is not that of a campaign.
+    """
     path = folder / SETTINGS
     try:
         settings: dict[str, Any] = decode(regular(path).read_bytes(), dict[str, Any])
@@ -323,7 +351,15 @@ def read_settings(folder: Path) -> dict[str, Any]:
 
 
 def recorded_scenario(settings: Mapping[str, Any], path: Path) -> Scenario:
-    """Return the scenario of a campaign, the paper's where it names none."""
+    """Return the scenario of a campaign, the paper's where it names none.
+
+    Args:
+        settings: content of `campaign.json`.
+        path: its path, for messages.
+
+    Raises:
+        UserError: the scenario is not one.
+    """
     recorded = settings.get("scenario")
     try:
         return US23 if recorded is None else convert(recorded, Scenario)
@@ -361,7 +397,11 @@ def read_outcomes(text: bytes, name: str, scenario: Scenario) -> tuple[list[Outc
 
 
 def failures(outcomes: Iterable[Outcome]) -> list[Outcome]:
-    """Return the failing outcomes, the worst first."""
+    """Return the failing outcomes, the worst first.
+
+    Args:
+        outcomes: outcomes of any order.
+    """
     failing = [outcome for outcome in outcomes if outcome.failed]
     return sorted(failing, key=lambda outcome: (outcome.margin, outcome.index))
 
@@ -382,7 +422,11 @@ def _by_level(outcomes: Iterable[Judged]) -> dict[int, tuple[list[Judged], Float
 
 
 def regions_of(outcomes: Iterable[Outcome]) -> dict[int, int]:
-    """Return the region (`fmc.regions`) of each failure within its level, by index of the case."""
+    """Return the region (`fmc.regions`) of each failure within its level, by index of the case.
+
+    Args:
+        outcomes: outcomes of one scenario.
+    """
     region: dict[int, int] = {}
     for group, points in _by_level(failures(outcomes)).values():
         for outcome, number in zip(group, regions(points).tolist(), strict=True):
@@ -391,7 +435,11 @@ def regions_of(outcomes: Iterable[Outcome]) -> dict[int, int]:
 
 
 def spread_failures(outcomes: Iterable[Outcome]) -> list[Outcome]:
-    """Return the failing outcomes: the worst of every region, then the second of each, ..."""
+    """Return the failing outcomes: the worst of every region, then the second of each, ...
+
+    Args:
+        outcomes: outcomes of one scenario.
+    """
     worst_first = failures(outcomes)
     region = regions_of(worst_first)
     before: Counter[tuple[int, int]] = Counter()
@@ -425,7 +473,12 @@ def _coverage(outcomes: Sequence[Outcome], tolerated: float) -> float:
 
 
 def batch_file(folder: Path, batch: int) -> Path:
-    """Return the path of the trajectories of a batch."""
+    """Return the path of the trajectories of a batch.
+
+    Args:
+        folder: folder of the campaign.
+        batch: number of the batch.
+    """
     return folder / TRAJECTORIES / f"{batch:05d}.npz"
 
 

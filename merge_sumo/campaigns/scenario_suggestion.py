@@ -31,16 +31,24 @@ FOLLOW_UP_S: Final = 5.0
 
 
 def suggested_lane_m(road: Road) -> Bounds | None:
-    """Return where a scenario on a road has the acceleration lane, around the expected merge.
+    """Return where a scenario has the acceleration lane, around the expected merge, in m.
 
-    None where the road has none on which a driver chooses where to merge.
+    Args:
+        road: the road.
+
+    Returns:
+        Begin and end; None without a lane on which a driver chooses where to merge.
     """
     lane = road.acceleration_lane
     return lane_around_m(lane.length_m) if lane is not None and lane.gives_a_choice else None
 
 
 def kind_of_merge(road: Road) -> list[str]:
-    """Return which kind of merge a road is taken for, and why, in sentences."""
+    """Return which kind of merge a road is taken for, and why, in sentences.
+
+    Args:
+        road: the road.
+    """
     if road.is_one_path:
         return []
     lane = road.acceleration_lane
@@ -81,6 +89,10 @@ def suggested(road: Road, name: str) -> Scenario:
     The VUT starts as far from M as in the paper, or as the ramp allows, and before an acceleration
     lane; the POV where, at some speed that the mainline drives at, it is at M about when a VUT on
     the level-0 profile is.
+
+    Args:
+        road: the road.
+        name: name of the scenario.
     """
     limit_mps = min(limit_at(road.mainline, -1.0), US23.v_hw_max_mps)
     gore_m = road.lane_m[0] if road.lane_m else 0.0
@@ -121,13 +133,22 @@ def _down(x_m: float) -> float:
 
 
 def limit_at(path: LanePath, x_m: float) -> float:
-    """Return the speed limit at a coordinate of a path."""
+    """Return the speed limit at a coordinate of a path, in m/s.
+
+    Args:
+        path: the path.
+        x_m: the coordinate; M is 0.
+    """
     found = [limit for start_m, limit in path.speed_limits_mps() if start_m <= x_m]
     return found[-1] if found else path.speed_limits_mps()[0][1]
 
 
 def about(road: Road) -> list[str]:
-    """Describe a road in lines."""
+    """Describe a road in lines.
+
+    Args:
+        road: the road.
+    """
     lines = [f"net: {road.path.name}"]
     paths = {
         "mainline": (road.mainline, road.mainline_edges),
@@ -165,7 +186,12 @@ def about(road: Road) -> list[str]:
 
 
 def lane_warnings(scenario: Scenario, road: Road) -> list[str]:
-    """Return sentences on an acceleration lane that a scenario does not use, or only in part."""
+    """Return sentences on an acceleration lane that a scenario does not use, or only in part.
+
+    Args:
+        scenario: the scenario.
+        road: its road.
+    """
     lane = road.acceleration_lane
     if lane is None or not lane.gives_a_choice:
         return []
@@ -194,9 +220,12 @@ regret of up to 4 % and collided nowhere avoidably; farther away, of up to 136 %
 def unseen(scenario: Scenario, policies: Path | None = None) -> list[str]:
     """Return the differences of a scenario from the training of the learned drivers, in sentences.
 
-    `policies` is the folder of these drivers, by default of the shipped ones for the scenario. They
-    measure in the units of the scenario that they play, so its numbers are compared after a
-    conversion into the units of training. Outside, levels 1 and 2 are extrapolations.
+    The drivers measure in the units of the scenario that they play, so its numbers are compared
+    after a conversion into the units of training. Outside, levels 1 and 2 are extrapolations.
+
+    Args:
+        scenario: the scenario.
+        policies: folder of the drivers; by default the shipped ones for the scenario.
     """
     folder = policies or policies_of(scenario)
     trained = {scenario_of(entry) for entry in read_manifest(folder).values()}

@@ -167,7 +167,11 @@ class CampaignSettings(Search):
         return partial(has_converged, tolerated=self.tolerated)
 
     def new_sampler(self, predictor: Predictor | None = None) -> Sampler:
-        """Return the sampler, without outcomes; `predictor` as of `make_sampler`."""
+        """Return the sampler, without outcomes.
+
+        Args:
+            predictor: as of `make_sampler`.
+        """
         sampler = make_sampler(self.sampler, self.pool, self.seed, predictor)
         sampler.tolerated = self.tolerated
         return sampler
@@ -304,7 +308,11 @@ def settings_from_folder(
 
 
 def controllers(record: Mapping[str, Any]) -> dict[str, str]:
-    """Return the controllers of a record that are code of a user's, by the name of the setting."""
+    """Return the controllers of a record that are code of a user's, by the name of the setting.
+
+    Args:
+        record: content of `campaign.json`.
+    """
     found = {}
     for name in CONTROLLERS:
         spec = record.get(name)

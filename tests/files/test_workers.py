@@ -8,7 +8,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -47,11 +46,6 @@ def process_ids(items):
 
 def refuse(items):
     raise UserError(f"nothing like {items[0]} here")
-
-
-def slowly(items):
-    time.sleep(0.3)
-    return squares(items)
 
 
 def killed_once_at(flag: Path, deadly: int, items):
@@ -143,15 +137,6 @@ class TestAWorkerThatDies:
 
 
 class TestLocalProcesses:
-    @pytest.mark.slow
-    def test_do_not_hear_ctrl_c(self, two):
-        ids = set(two.run(process_ids, range(8), no_loss, chunk=1))
-        results = two.run(slowly, range(4), no_loss, chunk=1)
-        first = next(results)
-        for process in ids:
-            os.kill(process, signal.SIGINT)
-        assert [first, *results] == [item * item for item in range(4)]
-
     @pytest.mark.slow
     def test_end_with_a_parent_that_is_killed(self, tmp_path):
         script = tmp_path / "parent.py"

@@ -6,13 +6,12 @@ from merge_sumo.analysis.truth import TruthKey
 from merge_sumo.controllers.kinds import load
 from merge_sumo.controllers.spec import ControllerKind, ControllerOptions
 from merge_sumo.drivers.policies import policies_of
-from merge_sumo.metrics.criterion import Criterion
+from merge_sumo.metrics.criterion import PAPER_CRITERION, Criterion
 from merge_sumo.road.loader import road_for
 from merge_sumo.scenario.scenario import US23, Scenario
 from merge_sumo.simulation.plan import MAX_CORRIDORS, SimulationPlan
 from merge_sumo.simulation.povs import Povs
 
-PAPERS = Criterion()
 POVS = Povs(policies=policies_of(US23))
 
 
@@ -20,7 +19,7 @@ def plan_for(
     vut: str | ControllerKind,
     *,
     scenario: Scenario = US23,
-    criterion: Criterion = PAPERS,
+    criterion: Criterion = PAPER_CRITERION,
     povs: Povs | None = None,
     corridors: int = MAX_CORRIDORS,
 ) -> SimulationPlan:
