@@ -77,7 +77,7 @@ def names_of_levels(levels: AnyLevels) -> tuple[str, ...]:
     """
     if isinstance(levels, str):
         levels = levels.split(",")
-    elif isinstance(levels, int):
+    elif not isinstance(levels, Iterable):
         levels = [levels]
     names = [str(level).strip() for level in levels]
     return tuple(dict.fromkeys(names)) or ("",)
