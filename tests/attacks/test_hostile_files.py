@@ -5,7 +5,6 @@ Each row of the table changes one thing in an honest file. SUMO itself is real.
 
 from __future__ import annotations
 
-import json
 import os
 import re
 import shutil
@@ -22,7 +21,7 @@ from support.writers import tree
 
 import merge_sumo as ms
 from merge_sumo.analysis.truth import ground_truth
-from merge_sumo.campaigns.recorded import OUTCOMES, SETTINGS, TRAJECTORIES
+from merge_sumo.campaigns.recorded import OUTCOMES, SETTINGS
 from merge_sumo.errors import UserError
 from merge_sumo.road import xml_input
 from merge_sumo.road.loader import default_net_path, road_of
@@ -120,16 +119,6 @@ def truth(save: Callable[..., object] = np.savez, **changes: object) -> Change:
     return change
 
 
-def named(vut: str) -> Change:
-    """Give the controller of a campaign a name."""
-
-    def change(path: Path) -> None:
-        settings = json.loads(path.read_text())
-        path.write_text(json.dumps(settings | {"vut": vut}))
-
-    return change
-
-
 NET = "net.xml"
 TRUTH = KEPT.path(Path()).name
 LAUGHS = "".join(f"<!ENTITY a{n} '{f'&a{n - 1};' * 10}'>" for n in range(1, 10))
@@ -146,7 +135,6 @@ ATTACKS = {
     "projection": (NET, instead('"!"', '"+proj=utm +nadgrids=~/secret.xml"'), host, "hosted"),
     "schema": (NET, instead("http://[^ ]*net_file.xsd", "http://~"), host, "hosted"),
     "XInclude": (RECORD, first(INCLUDE), play, "identical"),
-    "instruction": (RECORD, first('<?include href="~/secret.xml"?>'), play, "identical"),
     "configuration": (CONFIG, first('<log value="~/thesis"/>'), play, "identical"),
     # Not the content that it seems.
     "billion laughs": (NET, declared(f"<!ENTITY a0 'ha'>{LAUGHS}"), host, DECLARES),
@@ -156,10 +144,8 @@ ATTACKS = {
     "UTF-16": (RECORD, in_utf_16, play, "save it as UTF-8"),
     "far time": (RECORD, instead('time="0.10"', 'time="9e99"'), play, "missing or wrong value"),
     # Not the file that it seems.
-    "long name": (SETTINGS, named("<script>" * 10**6), export, "a text of at most 10,000"),
-    "pipe of settings": (SETTINGS, pipe, export, "it is not a file"),
+    "long name": (SETTINGS, instead("design1", "<script>" * 10**6), export, "at most 10,000"),
     "pipe of outcomes": (OUTCOMES, pipe, export, "it is not a file"),
-    "pipe of motion": (f"{TRAJECTORIES}/00000.npz", pipe, export, "it is not a file"),
     "terabyte": (HOSTED_NET, of_a_terabyte, play, "it is larger than"),
     "link to a secret": (RECORD, linked("../home/secret.xml"), play, "must have"),
     "link to zeroes": (CASE, linked("/dev/zero"), play, "it is not a file"),

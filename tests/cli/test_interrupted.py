@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.attacks import SIGNALS, SumoSimulation, stop
+from support.attacks import SIGNALS, Workspace, stop
 from support.processes import wait_for
 
 from merge_sumo.files import TEMPORARY
@@ -64,14 +64,14 @@ VERBS = {
 }
 
 
-def given(simulation: SumoSimulation, verb: Verb, workers: int) -> tuple[object, ...]:
+def given(simulation: Workspace, verb: Verb, workers: int) -> tuple[object, ...]:
     """Return the words of a verb where it stands."""
     begun = verb.resume and (simulation.root / "new" / "campaign.json").exists()
     words = (verb.resume if begun else verb.command).split()
     return *words, *(("--workers", workers) if verb.has_workers else ())
 
 
-def whole(verb: Verb, simulation: SumoSimulation) -> tuple[Any, dict[str, bytes], float]:
+def whole(verb: Verb, simulation: Workspace) -> tuple[Any, dict[str, bytes], float]:
     """Return what a verb says and makes on one worker, and how long it takes."""
     start = time.monotonic()
     code, out, err = simulation.run(*given(simulation, verb, 1))
@@ -114,8 +114,8 @@ def test_what_was_stopped_is_made_to_the_byte_and_nothing_stays(name, run, tmp_p
     assert made(simulation) == expected
 
 
-def prepared(run, root: Path) -> SumoSimulation:
-    simulation = SumoSimulation(root)
+def prepared(run, root: Path) -> Workspace:
+    simulation = Workspace(root)
     shutil.copytree(run.folder, root / "run")
     (root / "own.py").write_text(CONTROLLER)
     return simulation
@@ -132,7 +132,7 @@ VARYING = (".png", ".html")
 """Ends of names of files that hold times."""
 
 
-def made(simulation: SumoSimulation) -> dict[str, bytes]:
+def made(simulation: Workspace) -> dict[str, bytes]:
     """Return the files with a name of ours, with nothing for the content of those that vary."""
     return {
         name: b"" if name.endswith(VARYING) else content

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.attacks import SumoSimulation
+from support.attacks import Workspace
 from support.campaigning import campaign_settings, run_campaign
 from support.plans import plan_for
 from support.processes import wait_for
@@ -228,7 +228,7 @@ class TestADaskCluster:
     @pytest.mark.slow
     def test_that_is_gone_is_a_sentence_that_says_how_to_go_on(self, cluster, tmp_path):
         address, _, scheduler = cluster
-        simulation = SumoSimulation(tmp_path / "simulation")
+        simulation = Workspace(tmp_path / "simulation")
         words = "campaign --vut design1 --level 0 --sampler uniform --cases 20000 --out run"
         process = simulation.start(*words.split(), "--gate", "fmc>0.5", "--workers", address)
         outcomes = simulation.root / "run" / OUTCOMES

@@ -16,8 +16,8 @@ from support.processes import marked
 PATIENCE_S = 600.0
 
 
-class SumoSimulation:
-    """A working folder, a cache and a folder for temporary files, and the processes that use them.
+class Workspace:
+    """A working folder, a cache and a folder for temporary files, and the processes in them.
 
     `prefix` is the program that starts merge-sumo.
     """
@@ -52,7 +52,7 @@ class SumoSimulation:
         return process.returncode, out, err
 
     def has_ended(self) -> bool:
-        """Return whether no process of this simulation is left."""
+        """Return whether no process of this workspace is left."""
         return not marked(self.mark)
 
     def files(self) -> dict[str, bytes]:
