@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from merge_sumo.campaigns.repeatability import difference
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.controllers.built_in import BUILT_IN_VUTS
 from merge_sumo.controllers.kinds import KINDS
@@ -23,7 +24,7 @@ from merge_sumo.errors import ControllerError, UserError
 from merge_sumo.metrics.plausibility import doubts, mostly_clipped
 from merge_sumo.result import Result, Shown
 from merge_sumo.scenario.case import Case, FloatArray, from_unit
-from merge_sumo.scenario.scenario import DT_S, US23, Scenario
+from merge_sumo.scenario.scenario import US23, Scenario
 from merge_sumo.scenario.trajectory import End, Trajectory
 from merge_sumo.simulation.plan import SimulationPlan
 from merge_sumo.simulation.simulator import Simulator
@@ -167,11 +168,9 @@ class _Timed(DriverWrapper):
 def _differences(when: str, before: Sequence[Trajectory], after: Sequence[Trajectory]) -> list[str]:
     """Return a sentence on the first two motions that differ and should be the same, if any."""
     for one, other in zip(before, after, strict=True):
-        if not np.array_equal(one.motion, other.motion):
-            rows = min(len(one.motion), len(other.motion))
-            differs = (one.motion[:rows] != other.motion[:rows]).any(axis=(1, 2))
-            step = np.append(differs, True).argmax()
-            return [f"After {when} it drives differently from t = {step * DT_S:g} s on."]
+        from_s, _ = difference(one, other)
+        if from_s is not None:
+            return [f"After {when} it drives differently from t = {from_s:g} s on."]
     return []
 
 

@@ -136,14 +136,23 @@ def second_run_of(outcome: Outcome, trajectory: Trajectory, second: Episode) -> 
         trajectory: trajectory of the first run.
         second: the second run.
     """
-    differs_from_s, first = _difference(trajectory, second.trajectory)
+    differs_from_s, first = difference(trajectory, second.trajectory)
     end, failed = second.outcome.measures.end, second.outcome.failed
     other_verdict = (end, failed) != (outcome.measures.end, outcome.failed)
     return SecondRun(outcome.index, differs_from_s, first, end, failed, other_verdict)
 
 
-def _difference(one: Trajectory, other: Trajectory) -> tuple[float | None, Vehicle | None]:
-    """Return the time from which two motions differ, and the vehicle that differs first."""
+def difference(one: Trajectory, other: Trajectory) -> tuple[float | None, Vehicle | None]:
+    """Compare the motions of two runs of a case.
+
+    Args:
+        one: a run.
+        other: another run.
+
+    Returns:
+        The time in s from which they differ, None where they do not, and the vehicle that differs
+        first, None where several do.
+    """
     rows = min(len(one.whole), len(other.whole))
     first, second = one.whole[:rows].copy(), other.whole[:rows].copy()
     first[-1, :, 2] = second[-1, :, 2] = 0.0  # a last acceleration is 0 by definition
