@@ -158,12 +158,12 @@ def failure_of(run: RecordedCampaign, index: int | None) -> Outcome:
     Raises:
         UserError: for an index without a case, and a case that did not fail.
     """
-    worst = failures(run.cases)[:1]
+    worst = failures(run.cases)
     if index is None and not worst:
         raise UserError(f"{run.folder} has no failure: nothing can be explained")
     outcome = worst[0] if index is None else run.outcome(index)
     if not outcome.failed:
-        such = "".join(f", such as {o.index}" for o in worst)
+        such = f", such as {worst[0].index}" if worst else ""
         raise UserError(f"case {index} did not fail: name a failure{such}")
     return outcome
 
@@ -176,7 +176,7 @@ def write_worst_explanation(study: RunStudy) -> None:
     Args:
         study: the campaign, and how its cases run.
     """
-    worst = failures(study.run.cases)[:1]
+    worst = failures(study.run.cases)
     if study.plan.needs_sumo is None and worst:
         plan = study.plan.with_engine(None)
         # Worker processes would take longer to start than these cases.

@@ -235,16 +235,13 @@ def read_distribution(
             known = ", ".join(sorted(even))
             raise UserError(f"levels must give weights to levels of the campaign: {known}")
         total = sum(weights.values())
-        if not 0.0 < total < math.inf:
-            raise UserError("levels must have weights that are not all 0, and finite")
+        if total == 0.0:
+            raise UserError("levels must have weights that are not all 0")
     except OSError as error:
         raise UserError(f"cannot read {path}: {error.strerror}") from error
     except UserError as error:
         raise UserError(f"{path}: {error}") from error
-    shares = {}
-    for level, weight in weights.items():
-        if weight > 0.0:
-            shares[int(level)] = weight / total
+    shares = {int(level): weight / total for level, weight in weights.items() if weight > 0.0}
     return Distribution(shares, marginals, scenario)
 
 
@@ -321,11 +318,6 @@ class Traffic(Record, frozen=True):
         return self.density_veh_per_km / 1000.0 * (high_m - low_m) * self.share_in_pool(scenario)
 
 
-def shipped_traffics() -> list[str]:
-    """Return the names of the traffics of the package."""
-    return sorted(path.stem for path in FOLDER.glob(f"*{SUFFIX}"))
-
-
 def named_traffic(name: str) -> Traffic:
     """Return a traffic of the package, or that of a TOML file.
 
@@ -335,13 +327,12 @@ def named_traffic(name: str) -> Traffic:
     Raises:
         UserError: where no such traffic exists, or the file is no traffic.
     """
-    known, path = shipped_traffics(), Path(name)
-    if name in known:
-        path = FOLDER / f"{name}{SUFFIX}"
-    elif path.suffix != SUFFIX:
+    shipped = {path.stem: path for path in sorted(FOLDER.glob(f"*{SUFFIX}"))}
+    path = shipped.get(name, Path(name))
+    if path.suffix != SUFFIX:
         raise UserError(
-            f"there is no traffic {name!r}: {meant(name, known)}choose {', '.join(known)}, or a "
-            f"file NAME{SUFFIX}"
+            f"there is no traffic {name!r}: {meant(name, list(shipped))}choose "
+            f"{', '.join(shipped)}, or a file NAME{SUFFIX}"
         )
     _, record = read_toml(path, "traffic")
     try:

@@ -267,7 +267,7 @@ def failure_probability(
         distribution=distribution.record(),
         seed=options.seed,
         engine=study.plan.engine,
-        campaign=study.record(),
+        campaign=study.settings.to_record(study.plan),
     )
     write_new(out, to_json(result, indent=2))
     return result

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from numbers import Integral
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Generic, TypeVar
 
 from merge_sumo.campaigns.recorded import RecordedCampaign
 from merge_sumo.campaigns.settings import CampaignSettings, same_pov
@@ -170,10 +170,6 @@ class RunStudy:
             self.on_cases(1)
         return results
 
-    def record(self) -> dict[str, Any]:
-        """Return the settings, versions and hashes of the study, as in `campaign.json`."""
-        return self.settings.to_record(self.plan)
-
     def check_same_system(self, *, may_change: bool = False) -> None:
         """Check that net and POVs are those of the campaign.
 
@@ -183,7 +179,7 @@ class RunStudy:
         Raises:
             UserError: where the campaign had another net or other POVs.
         """
-        run, road, now = self.run, self.plan.road, self.record()
+        run, road, now = self.run, self.plan.road, self.settings.to_record(self.plan)
         if run.settings.net_sha256 not in (None, road.sha256):
             raise UserError(
                 f"{run.folder} was run on another net than {road.path} is now: put that back"

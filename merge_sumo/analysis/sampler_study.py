@@ -117,10 +117,7 @@ def search(
         found = SamplerRun([], [])
         for group in groups:
             found.outcomes.extend(episode.outcome for episode in group)
-            total = 0.0
-            for level in levels:
-                total += fmc(found.failures(level))
-            found.fmc.append(total)
+            found.fmc.append(sum(fmc(found.failures(level)) for level in levels))
         searches.append(found)
     return searches
 

@@ -19,7 +19,7 @@ from merge_sumo.analysis.run_study import RunStudy, StudyFile, end_of
 from merge_sumo.campaigns.recorded import RecordedCampaign
 from merge_sumo.controllers.process import LOG
 from merge_sumo.errors import UserError
-from merge_sumo.metrics.summary import clopper_pearson, undecided
+from merge_sumo.metrics.summary import clopper_pearson, summarise
 from merge_sumo.records import Record
 from merge_sumo.scenario.case import Case, Pool
 from merge_sumo.scenario.scenario import Scenario
@@ -101,13 +101,10 @@ def own_shares(run: RecordedCampaign) -> list[LevelShare]:
     Args:
         run: the campaign.
     """
-    unsure = undecided(run.outcomes, run.tolerated)
     shares = []
-    for level in run.levels:
-        cases = [outcome for outcome in run.cases if outcome.case.level == level]
-        failures = sum(outcome.failed and outcome.index not in unsure for outcome in cases)
-        unknown = sum(not outcome.is_tested or outcome.index in unsure for outcome in cases)
-        shares.append(LevelShare(level, len(cases), failures, unknown))
+    for level, found in summarise(run.outcomes, run.levels, run.tolerated).levels.items():
+        without_verdict = found.cases - found.tested + found.undecided
+        shares.append(LevelShare(level, found.cases, found.failures, without_verdict))
     return shares
 
 
