@@ -53,7 +53,12 @@ class Pair:
     scenario: str = "us23"
 
     def settings(self, cases: int, seed: int) -> CampaignSettings:
-        """Return the settings of a campaign of the new version against the old one."""
+        """Return the settings of a campaign of the new version against the old one.
+
+        Args:
+            cases: number of cases.
+            seed: seed of the campaign.
+        """
         scenario = named_scenario(self.scenario)
         return CampaignSettings(
             vut=self.new,
@@ -93,11 +98,20 @@ class Versions:
         }
 
     def covered(self, found: FloatArray) -> float:
-        """Return the share of the truth's regressions near a point of `found`, (m, d)."""
+        """Return the share of the regressions of the truth near a regression that was found.
+
+        Args:
+            found: regressions that were found, (m, d).
+        """
         return float(covered(self.regressions, found).mean())
 
     def against(self, cases: int, seed: int) -> FloatArray:
-        """Return the regressions that a campaign against the old version finds, (k, d)."""
+        """Return the regressions that a campaign against the old version finds, (k, d).
+
+        Args:
+            cases: number of cases.
+            seed: seed of the campaign.
+        """
         settings = self.pair.settings(cases, seed)
         models = ControllerModelPair(
             controller_model_of(self.both, settings.pool, seed),
@@ -115,7 +129,11 @@ class Versions:
     def independent(self, cases: int, seed: int) -> FloatArray:
         """Return the regressions that two campaigns find, whose failures run with both, (k, d).
 
-        The failures of the old version's campaign are none, so that campaign need not run.
+        Failures of the old version's campaign are no regressions, so that campaign need not run.
+
+        Args:
+            cases: number of cases of each campaign.
+            seed: seed of the campaigns.
         """
         sampler = self.pair.settings(cases, seed).sampler
         (found,) = search(self.new, (self.pair.level,), cases, None, [(sampler, seed)])
@@ -128,12 +146,24 @@ class Versions:
 
 
 def passes(outcome: Outcome) -> bool:
-    """Return whether a case has a verdict and does not fail."""
+    """Return whether a case has a verdict and does not fail.
+
+    Args:
+        outcome: outcome of the case.
+    """
     return outcome.is_tested and not outcome.failed
 
 
 def measured(pair: Pair, options: argparse.Namespace) -> dict[str, Any]:
-    """Return the shares that are found of what a pair's new version breaks, and print them."""
+    """Measure and print the covered share of the regressions of a pair.
+
+    Args:
+        pair: the versions.
+        options: the options of the command line.
+
+    Returns:
+        Figures for the record: the truth, and the covered shares by seed of each kind of campaign.
+    """
     versions = Versions(pair, options.truth)
     shares = ", ".join(f"{name} {share:.4f}" for name, share in versions.shares.items())
     print(f"  truth of {options.truth} cases: {shares}", flush=True)

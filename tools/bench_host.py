@@ -47,7 +47,15 @@ VUT = "design1"
 
 
 def host_s(simulation: SumoSimulation, cases: list[Case]) -> tuple[float, list[Trajectory]]:
-    """Return the seconds that the host takes for cases, and the trajectories."""
+    """Run cases by the host.
+
+    Args:
+        simulation: an open simulation.
+        cases: the cases.
+
+    Returns:
+        Seconds of all cases, and the trajectories.
+    """
     pov = PovLibrary(
         simulation.corridors * (simulation.vehicles - 1), Povs(policies=policies_of(US23))
     )
@@ -58,7 +66,12 @@ def host_s(simulation: SumoSimulation, cases: list[Case]) -> tuple[float, list[T
 
 
 def bare_s_per_step(simulation: SumoSimulation, trajectories: list[Trajectory]) -> float:
-    """Return the seconds per step and corridor of a plain loop that moves vehicles as recorded."""
+    """Return the seconds per step and corridor of a plain loop that moves vehicles as recorded.
+
+    Args:
+        simulation: an open simulation.
+        trajectories: the recorded motions.
+    """
     # The same functions that the host calls: without the Python wrappers around them.
     raw = libsumo._libsumo
     set_speed, set_previous_speed = raw.vehicle_setSpeed, raw.vehicle_setPreviousSpeed
@@ -93,7 +106,12 @@ def bare_s_per_step(simulation: SumoSimulation, trajectories: list[Trajectory]) 
 
 
 def step_s_per_step(simulation: SumoSimulation, cases: list[Case]) -> float:
-    """Return the seconds per step and corridor of SUMO alone."""
+    """Return the seconds per step and corridor of SUMO alone.
+
+    Args:
+        simulation: an open simulation.
+        cases: the cases whose vehicles are on the road.
+    """
     step = libsumo.simulation.step
     spent = 0.0
     for wave in range(WAVES):
@@ -108,7 +126,11 @@ def step_s_per_step(simulation: SumoSimulation, cases: list[Case]) -> float:
 
 
 def process_s(cases: list[Case]) -> list[float]:
-    """Return the seconds of each case with a TraCI server of its own."""
+    """Return the seconds of each case with a TraCI server of its own.
+
+    Args:
+        cases: the cases.
+    """
     seconds = []
     with tempfile.TemporaryDirectory() as folder:
         net_file = Path(folder) / "one.net.xml"
@@ -177,13 +199,28 @@ def _episode_by_traci(
 
 
 def cases_of(scenario: Scenario, count: int) -> list[Case]:
-    """Return random cases at level 0."""
+    """Return random cases at level 0.
+
+    Args:
+        scenario: their scenario.
+        count: number of cases.
+    """
     points = np.random.default_rng(0).random((count, len(scenario.dimensions(0))))
     return from_unit(points, 0, scenario=scenario)
 
 
 def measured(scenario: Scenario, k: int, count: int, rounds: int) -> dict[str, list[float]]:
-    """Return the figures of each round in a simulation with `k` corridors."""
+    """Measure a simulation with several corridors.
+
+    Args:
+        scenario: scenario of the cases.
+        k: number of corridors.
+        count: number of cases of a round.
+        rounds: number of rounds.
+
+    Returns:
+        Figures of each round by name.
+    """
     row: dict[str, list[float]] = {"us": [], "cases_per_s": [], "to_bare": [], "to_step": []}
     cases = cases_of(scenario, count * min(k, 32) // 32)
     with SumoSimulation(k, scenario=scenario) as simulation:

@@ -56,7 +56,16 @@ class MergesAt(Level0Vut):
 
 
 def played(cases: Sequence[Case], pov: Driver, vut: Driver) -> list[Trajectory]:
-    """Return what happens in cases of one scenario, in their order."""
+    """Simulate cases of one scenario.
+
+    Args:
+        cases: the cases.
+        pov: driver of the POV.
+        vut: driver of the VUT.
+
+    Returns:
+        Trajectories in the order of the cases.
+    """
     scenario = cases[0].scenario
     simulation = KinematicSimulation(pov.corridors, road_for(scenario), scenario)
     ended = Rollout(simulation, pov, vut, cases).run()
@@ -75,7 +84,15 @@ def idm(
 
 
 def regrets(cases: Sequence[Case], lane_m: Bounds) -> dict[str, float]:
-    """Return the mean regret by the place of the merge in m, and print it with its spread."""
+    """Measure and print the mean regret by the place of the merge.
+
+    Args:
+        cases: the cases.
+        lane_m: begin and end of the acceleration lane in m.
+
+    Returns:
+        Mean regret by the place of the merge in m.
+    """
     means = {}
     k, reward = len(cases), Reward.of(US23)
     starts = np.array([[x for start in case.starts() for x in start] for case in cases])
@@ -101,7 +118,14 @@ def regrets(cases: Sequence[Case], lane_m: Bounds) -> dict[str, float]:
 
 
 def hard_braking(cases: Sequence[Case]) -> dict[str, int]:
-    """Return after how many easy merges cars brake hard, by the way they follow, and print it."""
+    """Count and print the easy merges after which cars brake hard.
+
+    Args:
+        cases: the cases.
+
+    Returns:
+        Number of such merges by the car-following model.
+    """
     found = {}
     print("followers   merges that need at most 1 m/s2   harder than 3 m/s2 after them")
     for name, follow in (("ACC", acc_mps2), ("IDM", idm)):

@@ -4,8 +4,8 @@
 
 After a campaign of 400 cases of `design1` at level 0, with 200 seeds: how many intervals of 600 and
 of 100,000 fresh cases hold the probability, and their mean width as a ratio to that of Clopper and
-Pearson with as many plain cases. A truth of 1,000,000 uniform cases says what fails; a fresh case
-is one of its cases in the same stratum, so that each verdict is the simulation's own.
+Pearson with the same number of plain cases. A truth of 1,000,000 uniform cases gives the share that
+fails; a fresh case is one of its cases in the same stratum, so that each verdict is simulated.
 """
 
 from __future__ import annotations

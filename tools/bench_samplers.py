@@ -61,7 +61,15 @@ def cases_to(wanted: float, points: Any, index: Any, most: int) -> float:
 
 
 def dense(options: argparse.Namespace, names: Sequence[str]) -> dict[str, Any]:
-    """Print and return how soon samplers find the failures of a dense truth."""
+    """Measure and print how soon samplers find the failures of a dense truth.
+
+    Args:
+        options: the options of the command line.
+        names: names of the samplers.
+
+    Returns:
+        Figures by sampler.
+    """
     level, cases = options.level, options.cases
     settings = CampaignSettings(vut=options.vut, levels=(level,), scenario=US23)
     plan = settings.load_plan().with_engine(Engine.KINEMATIC)

@@ -86,17 +86,30 @@ def memory_mb() -> float:
 
 
 def failed_and_memory(episode: Episode) -> tuple[bool, float]:
-    """Return the verdict on a case, and how large the process is that ran it."""
+    """Return the verdict on a case, and the memory in MB of the process that ran it.
+
+    Args:
+        episode: episode of the case.
+    """
     return episode.outcome.failed, memory_mb()
 
 
 def never(item: Any) -> Any:
-    """Stop: no worker may die in a benchmark."""
+    """Stop: no worker may die in a benchmark.
+
+    Args:
+        item: the item of the worker that died.
+    """
     raise RuntimeError(f"a worker died at {item}")
 
 
 def run_uniform(workers: Workers, points: FloatArray) -> float:
-    """Run the cases at points, (n, 2), and return the largest memory of a worker in MB."""
+    """Run cases, and return the largest memory of a worker in MB.
+
+    Args:
+        workers: where they run.
+        points: cases of the unit square, (n, 2).
+    """
     cases = Pool(levels=(0,), scenario=US23).cases(points, 0)
     largest_mb = 0.0
     for _, mb in evaluate(UNIFORM.load_plan(), cases, workers, failed_and_memory):
@@ -105,7 +118,11 @@ def run_uniform(workers: Workers, points: FloatArray) -> float:
 
 
 def truth(most: int) -> Figures:
-    """Return cost and memory for 100, 1,000, ... cases, all in the same worker process."""
+    """Return cost and memory for 100, 1,000, ... cases, all in the same worker process.
+
+    Args:
+        most: largest number of cases.
+    """
     rng = np.random.default_rng(0)
     figures: Figures = {}
     with Workers(LocalProcesses, 1) as workers:
@@ -123,7 +140,14 @@ def truth(most: int) -> Figures:
 
 
 def compute(limits_s: Sequence[float]) -> list[int]:
-    """Compute for some times; return how often for each."""
+    """Compute for some times.
+
+    Args:
+        limits_s: seconds of each computation.
+
+    Returns:
+        Number of rounds of each computation.
+    """
     counts = []
     for limit_s in limits_s:
         count, end = 0, time.perf_counter() + limit_s
@@ -188,7 +212,11 @@ class Served(Workers):
 
 
 def main_process_rate(cases: int) -> float:
-    """Return how many cases per second a campaign takes that workers have run."""
+    """Return the cases per second that the main process of a campaign can take from workers.
+
+    Args:
+        cases: number of cases.
+    """
     plan, pool = UNIFORM.load_plan(), UNIFORM.pool
     served = Served(simulate(plan, pool.cases(np.random.default_rng(3).random((500, 2)), 0)))
     loop = SearchLoop(make_sampler("uniform", pool, 0), plan, cases, workers=served, batch=BATCH)
@@ -221,7 +249,12 @@ def engines(_: int) -> Figures:
 
 
 def campaign(folder: Path, *options: str) -> float:
-    """Return the seconds of the whole command of a campaign in a folder."""
+    """Return the seconds of the whole command of a campaign.
+
+    Args:
+        folder: folder in which it runs.
+        options: further options of the command.
+    """
     command = [sys.executable, "-m", "merge_sumo.cli", "campaign", "--quiet", *options]
     quiet = partial(subprocess.run, check=True, stdout=subprocess.DEVNULL, cwd=folder)
     return seconds(partial(quiet, command))
@@ -241,7 +274,16 @@ def whole_campaigns(_: int) -> Figures:
 
 
 def slow_campaign(case_s: float, cases: int, *options: str) -> tuple[float, int]:
-    """Return the seconds of a whole command whose VUT sleeps, and the number of its cases."""
+    """Run the whole command of a campaign whose VUT sleeps.
+
+    Args:
+        case_s: seconds that the VUT sleeps in a case.
+        cases: largest number of cases.
+        options: further options of the command.
+
+    Returns:
+        Seconds of the command, and the number of cases that ran.
+    """
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
         (folder / "sleepy.py").write_text(SLEEPY.format(case_s=case_s))
@@ -303,7 +345,11 @@ def cases_to_most(flight: int | None, seed: int, levels: tuple[int, ...]) -> flo
 
 
 def files(most: int) -> Figures:
-    """Return the seconds for a finished campaign of 10,000, 100,000, ... cases."""
+    """Return the seconds for a finished campaign of 10,000, 100,000, ... cases.
+
+    Args:
+        most: largest number of cases.
+    """
     figures: Figures = {}
     with tempfile.TemporaryDirectory() as scratch:
         run = run_campaign(UNIFORM, UNIFORM.load_plan(), Path(scratch) / "run")
@@ -321,7 +367,12 @@ def files(most: int) -> Figures:
 
 
 def of_files(run: RecordedCampaign, outcomes: list[Any]) -> dict[str, float]:
-    """Return sizes in MB, and seconds for reading, FMC, regions and report of outcomes."""
+    """Return sizes in MB, and seconds for reading, FMC, regions and report of outcomes.
+
+    Args:
+        run: the campaign.
+        outcomes: its outcomes.
+    """
     run.outcomes = outcomes
     text = "".join(map(to_line, outcomes)).encode()
     points = to_unit((outcome.case for outcome in failures(outcomes)), 0, scenario=US23)

@@ -3,7 +3,7 @@
     python   an object with act(seen), in one corridor and per corridor of 32, in a process of its
              own and in this one
     traci    a client of the stock `traci` package in a process of its own: an id list, four
-             getters, setSpeed and a step; and one that subscribes to what it sees
+             getters, setSpeed and a step; and one that subscribes to the same values
     peer     the same client with SUMO's own TraCI server for two clients, where the other client
              moves the POV: what hosting a controller costs without our server
     fmu      a level-0 FMU of FMI 2.0, compiled here, in one corridor
@@ -88,7 +88,12 @@ except traci.FatalTraCIError:
 
 
 def us_per_step(driver: Driver, episodes: int) -> float:
-    """Return microseconds per step and corridor of a driver that moves by its own answers."""
+    """Return microseconds per step and corridor of a driver that moves by its own answers.
+
+    Args:
+        driver: the driver.
+        episodes: number of episodes.
+    """
     k = driver.corridors
     active, spent = np.ones(k, dtype=bool), 0.0
     for _ in range(episodes):
@@ -110,7 +115,13 @@ def us_per_step(driver: Driver, episodes: int) -> float:
 
 
 def us_of_peer(client: Path, folder: Path, episodes: int) -> float:
-    """Return microseconds per step with SUMO's own server for two clients."""
+    """Return microseconds per step with SUMO's own server for two clients.
+
+    Args:
+        client: program of the controller.
+        folder: folder for the files of SUMO.
+        episodes: number of episodes.
+    """
     net_file = folder / "peer.net.xml"
     road = road_of()
     net_file.write_bytes(road.path.read_bytes())
@@ -169,7 +180,7 @@ def opened(folder: Path, simulation: SumoSimulation) -> dict[str, Driver]:
 
     Args:
         folder: folder of the controllers.
-        simulation: a simulation, of which a TraCI controller is told road and scenario.
+        simulation: a simulation, whose road and scenario a TraCI controller gets.
     """
     (folder / "law.py").write_text(LAW)
     (folder / "client.py").write_text(CLIENT)

@@ -1,4 +1,4 @@
-"""Build the nets of sumo_net/ from the plain XML beside them: `python tools/build_net.py`.
+"""Build the nets of sumo_net/ from the plain XML next to them: `python tools/build_net.py`.
 
 Runs `netconvert -c` on every .netccfg and drops the header, which holds the time of the build, so
 that the same sources give the same bytes.
@@ -21,7 +21,15 @@ SOURCES = Path(__file__).resolve().parent.parent / "sumo_net"
 
 
 def build(configuration: Path, output: Path) -> bytes:
-    """Build the net of a configuration into `output`, ours or a new file; return its bytes."""
+    """Build the net of a configuration.
+
+    Args:
+        configuration: configuration of netconvert.
+        output: the net: the file in sumo_net/, or a new file.
+
+    Returns:
+        The bytes of the net.
+    """
     if output.parent != SOURCES:
         check_new(output)
     with tempfile.TemporaryDirectory() as folder:

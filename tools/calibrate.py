@@ -66,7 +66,11 @@ class Picture:
 
 
 def gap_of(episode: Episode) -> float:
-    """Return |dx| at M in m; infinite where the VUT does not arrive."""
+    """Return |dx| at M in m; infinite where the VUT does not arrive.
+
+    Args:
+        episode: episode of a case.
+    """
     dx_m = episode.outcome.measures.dx_m
     return np.inf if dx_m is None else abs(dx_m)
 
@@ -100,7 +104,12 @@ def picture(vut: str, design: Design, level: int, scenario: Scenario, apart: flo
 
 
 def draw(rng: np.random.Generator, around: RuleBasedDesign | None) -> RuleBasedDesign:
-    """Draw a design at random, or near another one."""
+    """Draw a design at random, or near another one.
+
+    Args:
+        rng: random generator.
+        around: the other design; None for a draw from all.
+    """
     if around is None:
         x1_m = rng.uniform(90.0, 180.0)
         gap_m = rng.uniform(12.0, 32.0)
@@ -128,7 +137,11 @@ def draw(rng: np.random.Generator, around: RuleBasedDesign | None) -> RuleBasedD
 
 
 def try_design2(design: RuleBasedDesign) -> dict[str, Any] | None:
-    """Return the figures of a design that has the picture of design2, else None."""
+    """Return the figures of a design that has the picture of design2, else None.
+
+    Args:
+        design: the design.
+    """
     level0 = picture("design2", design, 0, US23, RADIUS)
     if level0.smallest_gap_m < US23.dx_crash_m + 0.4:
         return None
@@ -153,7 +166,11 @@ def try_design2(design: RuleBasedDesign) -> dict[str, Any] | None:
 
 
 def search_designs(options: argparse.Namespace) -> None:
-    """Draw designs, most of them near the best so far, and print those that pass."""
+    """Draw designs, most of them near the best so far, and print those that pass.
+
+    Args:
+        options: the options of the command line.
+    """
     rng = np.random.default_rng(options.seed)
     best: list[tuple[float, RuleBasedDesign]] = []
     for _ in range(options.designs):

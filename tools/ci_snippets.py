@@ -1,11 +1,11 @@
-"""What docs/tutorials/ci.md shows for the CI of a controller, as files and as a script.
+"""Write the files and the script of docs/tutorials/ci.md for the CI of a controller.
 
 python tools/ci_snippets.py github FOLDER    the commands of the GitHub workflow, one per line
 python tools/ci_snippets.py gitlab FOLDER    those of the GitLab job
 
 The files of the page, the controller and its test, are written into FOLDER, a new one. `.ci/run`
-runs the commands there with the built wheel, so what the page shows is what is tested. Commands of
-`apt-get` are left out: they need root, and `.ci/run` installs the same packages itself.
+runs the commands there with the built wheel: that tests the page. Commands of `apt-get` are left
+out: they need root, and `.ci/run` installs the same packages itself.
 """
 
 from __future__ import annotations
@@ -23,12 +23,21 @@ GITHUB, GITLAB = ".github/workflows/merge.yml", ".gitlab-ci.yml"
 
 
 def files(text: str) -> dict[str, str]:
-    """Return the files that a page shows, by name: blocks with a title."""
+    """Return the files that a page shows, by name: blocks with a title.
+
+    Args:
+        text: the page.
+    """
     return dict(TITLED.findall(text))
 
 
 def commands(kind: str, text: str) -> list[str]:
-    """Return the commands of the GitHub workflow or the GitLab job of a page."""
+    """Return the commands of the GitHub workflow or the GitLab job of a page.
+
+    Args:
+        kind: "github" or "gitlab".
+        text: the page.
+    """
     shown = files(text)
     if kind == "github":
         (job,) = yaml.safe_load(shown[GITHUB])["jobs"].values()
@@ -43,7 +52,12 @@ def _lines(scripts: Any) -> list[str]:
 
 
 def main(kind: str, folder: Path) -> None:
-    """Write the files of the page into a new folder, and print the commands."""
+    """Write the files of the page, and print the commands.
+
+    Args:
+        kind: "github" or "gitlab".
+        folder: new folder of the files.
+    """
     text = PAGE.read_text(encoding="utf-8")
     folder.mkdir(parents=True)
     for name, content in files(text).items():

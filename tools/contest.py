@@ -71,7 +71,7 @@ LOST = "it ended its process each time"
 
 @dataclass(frozen=True, kw_only=True)
 class Search:
-    """A search that is to be run; its fields decide what it finds.
+    """A search to run; its fields decide its result.
 
     Attributes:
         problem: name of the problem.
@@ -118,7 +118,11 @@ class Found:
     fault: str | None = None
 
     def fmc_after(self, n: int) -> float:
-        """Return the FMC of the failures among the first n cases, summed over the levels."""
+        """Return the FMC of the failures among the first cases, summed over the levels.
+
+        Args:
+            n: number of cases.
+        """
         by_level = defaultdict(list)
         for index, level, *point in self.failures:
             if index < n:
@@ -126,7 +130,11 @@ class Found:
         return float(sum(fmc(points) for points in by_level.values()))
 
     def cases_to(self, target: float) -> float:
-        """Return the cases until the FMC is at a target; infinite where it never is."""
+        """Return the number of cases until the FMC is at a target; infinite where it never is.
+
+        Args:
+            target: the target.
+        """
         indices = sorted(int(row[0]) for row in self.failures)
         low, high = 0, len(indices)  # FMC never falls
         while low < high:
@@ -193,7 +201,14 @@ def _lost(search: Search) -> Found:
 
 
 def read_found(path: Path) -> Found | None:
-    """Return a search that was written; None where there is none, or it is damaged."""
+    """Read the result of a search.
+
+    Args:
+        path: its file.
+
+    Returns:
+        The result; None where the file does not exist, or is damaged.
+    """
     try:
         found: Found = decode(regular(path).read_bytes(), Found)
     except (OSError, UserError):
@@ -227,7 +242,12 @@ class ProblemScore:
 
 
 def problem_score(found: Sequence[Found], truth: ProblemTruth) -> ProblemScore:
-    """Compare the searches of a sampler, one a seed, with the truth of their problem."""
+    """Compare the searches of a sampler with the truth of their problem.
+
+    Args:
+        found: one search for each seed.
+        truth: truth of the problem.
+    """
     shares = {}
     for n in counted(found[0].search.cases):
         shares[n] = [truth.share(one.fmc_after(n)) for one in found]
@@ -268,7 +288,12 @@ class SamplerScore:
 
 
 def sampler_score(entrant: Entrant, problems: dict[str, ProblemScore]) -> SamplerScore:
-    """Return the scores of a sampler by those on each problem."""
+    """Return the scores of a sampler over all problems.
+
+    Args:
+        entrant: the sampler.
+        problems: its scores by problem.
+    """
     shares = [list(one.shares.values()) for one in problems.values()]  # (problems, N, seeds)
     by_n = np.median(shares, axis=2).mean(axis=0)
     counts = next(iter(problems.values())).shares
@@ -287,17 +312,30 @@ def sampler_score(entrant: Entrant, problems: dict[str, ProblemScore]) -> Sample
 
 
 def counted(cases: int) -> tuple[int, ...]:
-    """Return the numbers of cases after which the share of a search counts."""
+    """Return the numbers of cases after which the share of a search counts.
+
+    Args:
+        cases: number of cases of a search.
+    """
     return tuple(n for n in COUNTED if n <= cases) or (cases,)
 
 
 def finite(number: float) -> float | None:
-    """Return a finite number, and None for an infinite one."""
+    """Return a finite number, and None for an infinite one.
+
+    Args:
+        number: the number.
+    """
     return float(number) if math.isfinite(number) else None
 
 
 def oracle_by_cases(truths: dict[str, ProblemTruth], cases: int) -> dict[int, float]:
-    """Return the mean over the problems of the oracle's share, by N."""
+    """Return the mean share of the oracle over the problems, by number of cases.
+
+    Args:
+        truths: truths by problem.
+        cases: number of cases of a search.
+    """
     shares = {}
     for n in counted(cases):
         shares[n] = float(np.mean([one.share(float(one.oracle[n])) for one in truths.values()]))
@@ -381,7 +419,17 @@ def searches_of(
 
 
 def parsed(arguments: Sequence[str] | None) -> argparse.Namespace:
-    """Return the options of the command line; `UserError` for numbers out of range."""
+    """Parse the command line.
+
+    Args:
+        arguments: its arguments; None for those of the process.
+
+    Returns:
+        The options.
+
+    Raises:
+        UserError: a number is out of range.
+    """
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -415,7 +463,11 @@ def parsed(arguments: Sequence[str] | None) -> argparse.Namespace:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run the contest that the command line names; write and print its numbers."""
+    """Run the contest that the command line names; write and print its numbers.
+
+    Args:
+        arguments: arguments of the command line; None for those of the process.
+    """
     options = parsed(arguments)
     folder, problems = options.out / SEARCHES, options.problems
     found: dict[Search, Found] = {}

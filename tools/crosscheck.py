@@ -2,10 +2,10 @@
 
 - Motion: the recorded accelerations are given to HighwayEnv's vehicles, from the recorded starts.
 - Verdicts: POVs and VUT drive HighwayEnv's vehicles, on the recorded cases and on fresh uniform
-  ones up to `--cases`, and the criterion of the campaign judges them beside SUMO.
+  ones up to `--cases`, and the criterion of the campaign judges them next to SUMO.
 
-For campaigns of a VUT of this package. Needs the extra `peers`. Exit code 1 where vehicles that are
-told the same move otherwise there; docs/explanations/other-simulators.md has the results.
+For campaigns of a VUT of this package. Needs the extra `peers`. Exit code 1 where vehicles with the
+same commands move differently there; docs/explanations/other-simulators.md has the results.
 
 HighwayEnv (Leurent, 2018) moves a vehicle that does not steer by x + v dt and v + a dt, which is
 eq. (4). Each vehicle of an episode has a straight lane of its own there, along which it drives its
@@ -98,12 +98,21 @@ class HighwayEnvWorld(KinematicSimulation):
         self._read([corridor])
 
     def park(self, corridor: int) -> None:
-        """Take the vehicles of a corridor from its road."""
+        """Take the vehicles of a corridor from its road.
+
+        Args:
+            corridor: the corridor.
+        """
         self._roads[corridor].vehicles = []
         super().park(corridor)
 
     def command(self, a_mps2: FloatArray, merged: NDArray[np.bool_] | None = None) -> None:
-        """Let HighwayEnv make a step with accelerations, (A, K); no vehicle drives backwards."""
+        """Let HighwayEnv make a step; no vehicle drives backwards.
+
+        Args:
+            a_mps2: accelerations, (A, K).
+            merged: whether the VUT is on the mainline, (K,); None without an acceleration lane.
+        """
         actions = np.maximum(a_mps2, self.v_mps / -DT_S).T.tolist()
         occupied = [k for k, road in enumerate(self._roads) if road.vehicles]
         for corridor in occupied:
@@ -154,13 +163,19 @@ class Crosscheck:
 
     @property
     def agrees(self) -> bool:
-        """Whether both simulators move vehicles that are told the same alike."""
+        """Whether both simulators move vehicles alike under the same commands."""
         moves = any(MOVES_OTHERWISE in one for one in self.differences)
         return max(self.largest_m, self.largest_mps) <= AGREED and not moves
 
 
 def crosscheck(run: RecordedCampaign, cases: int, seed: int) -> Crosscheck:
-    """Let HighwayEnv repeat the cases of a campaign, and fresh uniform ones up to `cases`."""
+    """Let HighwayEnv repeat cases of a campaign, and run fresh uniform ones.
+
+    Args:
+        run: the campaign.
+        cases: number of cases of both kinds.
+        seed: seed of the fresh cases.
+    """
     settings = settings_from_folder(run.folder, run.record)
     plan = settings.load_plan()
     if plan.needs_sumo is not None:
@@ -183,7 +198,13 @@ def crosscheck(run: RecordedCampaign, cases: int, seed: int) -> Crosscheck:
 
 
 def uniform(settings: CampaignSettings, count: int, seed: int) -> list[Case]:
-    """Return uniform cases, about as many at each level."""
+    """Return uniform cases, equally shared by the levels.
+
+    Args:
+        settings: settings of the campaign.
+        count: number of cases.
+        seed: seed of the cases.
+    """
     fresh: list[Case] = []
     for level, share in zip(
         settings.levels,
@@ -197,12 +218,25 @@ def uniform(settings: CampaignSettings, count: int, seed: int) -> list[Case]:
 
 
 def failed(plan: SimulationPlan, trajectory: Trajectory) -> bool:
-    """Return whether a case fails by the criterion of the campaign."""
+    """Return whether a case fails by the criterion of the campaign.
+
+    Args:
+        plan: plan of the campaign.
+        trajectory: motion of the case.
+    """
     return plan.criterion.outcome(trajectory, centre_lines(plan.road)).failed
 
 
 def largest_deviations(plan: SimulationPlan, known: Sequence[Trajectory]) -> tuple[float, float]:
-    """Return the largest differences, in m and m/s, of motions from HighwayEnv's."""
+    """Compare motions with HighwayEnv's.
+
+    Args:
+        plan: plan of the campaign.
+        known: motions of merge-sumo.
+
+    Returns:
+        Largest differences in m and in m/s.
+    """
     off = np.zeros(2)
     for first in range(0, len(known), CHUNK):
         motions = [one.motion for one in known[first : first + CHUNK]]
@@ -224,7 +258,12 @@ def largest_deviations(plan: SimulationPlan, known: Sequence[Trajectory]) -> tup
 
 
 def reason_of(sumo: Trajectory, there: Trajectory) -> str:
-    """Return the reason for another verdict, in a clause."""
+    """Return the reason for another verdict, in a clause.
+
+    Args:
+        sumo: motion in merge-sumo.
+        there: motion in HighwayEnv.
+    """
     rows = min(len(sumo.motion), len(there.motion))
     apart = np.abs(sumo.motion[:rows] - there.motion[:rows])
     differs = np.flatnonzero((apart[..., :2] > AGREED).any(axis=(1, 2)))

@@ -20,7 +20,7 @@ SHOWN = (
     *("policies/README.md", "policies/roundabout/README.md", "policies/human/README.md"),
     *("scenarios/README.md", "sumo_net/README.md"),
 )
-"""Pages that stand beside what they are about, and not in docs/."""
+"""Pages of other folders than docs/, next to their subject."""
 PICTURES = "scenarios/**/*.png"
 
 
@@ -46,9 +46,9 @@ def cli_page() -> str:
 
     text = cli.app.generate_docs().replace("# merge-sumo\n", EXIT_CODES, 1)
     text = re.sub(r"## Table of Contents\n.*?\n(?=\*\*)", "", text, flags=re.DOTALL)
-    # An example is on a line of its own in --help, and is a block here.
+    # An example is on a line of its own in --help, and in a block on the page.
     text = re.sub(r"^Example:\s+(.*)$", r"```text\n\1\n```", text, flags=re.MULTILINE)
-    text = re.sub(r"(, --no-[\w-]+)+", "", text)  # it shows opposites that there are not
+    text = re.sub(r"(, --no-[\w-]+)+", "", text)  # it shows opposites that do not exist
     return re.sub(r"\n {8,}", " ", text)
 
 
@@ -120,7 +120,15 @@ TABLE: Final = re.compile(r"<!-- table: ([\w ]+) -->")
 
 
 def on_files(files: Any, config: Any) -> Any:
-    """Add to the files of the site what docs/ does not hold (MkDocs calls this)."""
+    """Add pages and pictures from other folders to the site; MkDocs calls this.
+
+    Args:
+        files: files of the site.
+        config: configuration of MkDocs.
+
+    Returns:
+        The files with those that were added.
+    """
     from mkdocs.structure.files import File
 
     for path in (*SHOWN, *(p.relative_to(ROOT).as_posix() for p in ROOT.glob(PICTURES))):
@@ -129,9 +137,13 @@ def on_files(files: Any, config: Any) -> Any:
 
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
-    """Return a page as the site shows it, with tables and its own links (MkDocs calls this).
+    """Return a page with its tables, and with links as the site has them; MkDocs calls this.
 
-    Links out of and into docs/ are written as they hold in a checkout.
+    Links into and out of docs/ are written as a checkout needs them.
+
+    Args:
+        markdown: the page as in the checkout.
+        page: page of MkDocs.
     """
     markdown = TABLE.sub(lambda table: TABLES[table[1]](), markdown)
     up = "../" * page.file.src_uri.count("/")

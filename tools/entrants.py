@@ -54,9 +54,13 @@ class Entrant:
 
 
 def sampler_class(spec: str) -> type[Sampler]:
-    """Return the sampler that a spec names; `UserError` where there is none.
+    """Load a sampler; a file is executed, so only in a worker process.
 
-    A file is executed: in a worker process alone.
+    Args:
+        spec: name of the registry, or FILE.py:CLASS.
+
+    Raises:
+        UserError: no such sampler exists.
     """
     source, _, name = spec.rpartition(":")
     if not source.endswith(".py"):
@@ -74,12 +78,19 @@ def sampler_class(spec: str) -> type[Sampler]:
 
 
 def check_spec(spec: str) -> None:
-    """Raise `UserError` where a spec names neither a sampler of the registry nor a file."""
+    """Check that a sampler exists, without loading it.
+
+    Args:
+        spec: name of the registry, or FILE.py:CLASS.
+
+    Raises:
+        UserError: it is neither a sampler of the registry nor a file.
+    """
     source, _, name = spec.rpartition(":")
     if source.endswith(".py") and name.isidentifier() and Path(source).is_file():
         return
     if ".py" in spec:
-        raise UserError(f"there is no sampler {spec!r}: write FILE.py:CLASS of a file")
+        raise UserError(f"unknown sampler {spec!r}: write FILE.py:CLASS of a file")
     SAMPLERS[spec]
 
 
@@ -112,15 +123,22 @@ def _entrant(spec: str, watch: Watch) -> Entrant:
 
 
 def lost_entrant(spec: str) -> Entrant:
-    """Return the entrant of a sampler that ended its process in the contract."""
+    """Return the entrant of a sampler that ended its process in the contract.
+
+    Args:
+        spec: name of the registry, or FILE.py:CLASS.
+    """
     return Entrant(spec, fault=f"the sampler {spec} ends its process: run its contract by pytest")
 
 
 def violation(sampler: type[Sampler]) -> str | None:
-    """Return in a clause how a sampler breaks the contract; None where it keeps it.
+    """Test the contract of samplers: three levels and some thirty cases, without SUMO.
 
-    It is a pool of three levels and some thirty cases, without SUMO. An exception of the sampler is
-    raised.
+    Args:
+        sampler: class of the sampler; its exceptions are raised.
+
+    Returns:
+        The broken property in a clause; None where the sampler keeps the contract.
     """
     contract = SamplerContract()
     contract.sampler = sampler
@@ -153,7 +171,18 @@ class Watch:
         self._limit_s = self._left_s = limit_s
 
     def call(self, function: Callable[..., T], *arguments: Any) -> T:
-        """Return function(*arguments); raise `SamplerFaultError` for an exception or a delay."""
+        """Call a function of the sampler.
+
+        Args:
+            function: the function.
+            arguments: its arguments.
+
+        Returns:
+            Its result.
+
+        Raises:
+            SamplerFaultError: it raised an exception, or took too long.
+        """
         self.deadline.deadline_s = max(self._left_s, 1e-3)
         start_s, start_cpu_s = perf_counter(), process_time()
         try:
@@ -191,7 +220,11 @@ class WatchedSampler(Sampler):
         return size
 
     def ask(self, n: int) -> list[Case]:
-        """Return the next `n` cases, which are of the pool."""
+        """Return the next cases, which are of the pool.
+
+        Args:
+            n: number of cases.
+        """
         cases = self._watch.call(self._sampler.ask, n)
         if not isinstance(cases, list) or len(cases) != n:
             raise SamplerFaultError(f"its answer is not a list of {n} cases")
@@ -208,7 +241,11 @@ class WatchedSampler(Sampler):
         return cases
 
     def prediction(self, place: int) -> Prediction | None:
-        """Return its prediction, which it is told again with the outcome."""
+        """Return the prediction of a case, which returns to the sampler with the outcome.
+
+        Args:
+            place: place of the case in the batch.
+        """
         if not self._sampler.uses_predictions:
             return None
         return self._watch.call(self._sampler.prediction, place)
@@ -216,6 +253,11 @@ class WatchedSampler(Sampler):
     def tell(
         self, outcomes: Sequence[Outcome], motions: Mapping[int, FloatArray] | None = None
     ) -> None:
-        """Tell it the outcomes, and the motions where it predicts."""
+        """Tell the sampler outcomes, and motions where it predicts.
+
+        Args:
+            outcomes: the outcomes.
+            motions: their motions, (T + 1, A, 3), by index.
+        """
         seen = motions if self._sampler.uses_predictions else None
         self._watch.call(self._sampler.tell, outcomes, seen)

@@ -58,7 +58,7 @@ def export_onnx(
     except ImportError as error:
         raise UserError("an export needs onnx: run `pip install 'merge-sumo[onnx]'`") from error
     if name not in NETWORKS:
-        raise UserError(f"there is no policy {name!r}: choose one of {', '.join(NETWORKS)}")
+        raise UserError(f"unknown policy {name!r}: choose one of {', '.join(NETWORKS)}")
     check_new(path)
     network = load_network(name, folder)
     if network.a_min_mps2 is not None:

@@ -102,7 +102,7 @@ class Planner(Driver):
 
 
 class Islands(Driver):
-    """Errs on islands of what it sees first, which nothing foretells.
+    """Errs on islands of the first observation, which nothing predicts.
 
     The islands come again with the speed of the POV and with the gap at M. There it drives towards
     a gap of 0, and elsewhere keeps 14 m on the side on which the POV would be.
@@ -157,7 +157,7 @@ class FrozenKind(ControllerKind):
         """Find the VUT; `UserError` for another name."""
         super().__init__(spec, options)
         if spec.argument not in FROZEN_VUTS:
-            raise UserError(f"there is no VUT {spec}: {meant(spec.argument, FROZEN_VUTS)}")
+            raise UserError(f"unknown VUT {spec}: {meant(spec.argument, FROZEN_VUTS)}")
 
     def driver(self, corridors: int, _simulation: object) -> Driver:
         """Return its driver."""

@@ -1,13 +1,13 @@
 """Kill campaigns and resume them: `python tools/kill_campaigns.py --kills 100`.
 
 Every campaign is killed once (SIGKILL), at a place drawn from a seed, and resumed; then its
-outcomes must be those of a campaign that nobody disturbed, byte for byte, and what it left in the
-folder for temporary files must be gone. The places take turns:
+outcomes must be those of an undisturbed campaign, byte for byte, and its temporary files must be
+gone. The places take turns:
 
     moment  any time between the start and the end of the campaign
     sync    between a write and its sync to the disk, of any file of the journal
     torn    in the middle of a write, of any file of the journal
-    worker  a worker process, at any time; the campaign itself goes on
+    worker  a worker process, at any time; the campaign itself continues
 """
 
 from __future__ import annotations
@@ -48,7 +48,11 @@ PATIENCE_S = 600.0
 
 
 def settings_of(sampler: str) -> CampaignSettings:
-    """Return a campaign in which every batch depends on those before it, or runs ahead of them."""
+    """Return a campaign in which every batch depends on those before it, or runs ahead of them.
+
+    Args:
+        sampler: name of the sampler.
+    """
     return CampaignSettings(
         vut="design1",
         levels=(0, 1),
@@ -61,7 +65,14 @@ def settings_of(sampler: str) -> CampaignSettings:
 
 
 def forked(work: Callable[[], object]) -> int:
-    """Start work in a process of its own, without importing everything again."""
+    """Start work in a process of its own, without importing everything again.
+
+    Args:
+        work: the function that runs.
+
+    Returns:
+        The id of the process.
+    """
     pid = os.fork()
     if pid == 0:
         try:
@@ -74,7 +85,11 @@ def forked(work: Callable[[], object]) -> int:
 
 
 def ended(pid: int) -> int:
-    """Wait for a process and return its exit code, negative for a signal."""
+    """Wait for a process and return its exit code, negative for a signal.
+
+    Args:
+        pid: id of the process.
+    """
     return os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
 
 
@@ -84,7 +99,11 @@ def kill_me() -> None:
 
 
 def kill_at_sync(nth: int) -> None:
-    """Have this process killed between its nth write and the sync of it."""
+    """Let this process be killed between a write and the sync of it.
+
+    Args:
+        nth: number of the write.
+    """
     fsync, count = os.fsync, 0
 
     def counting(file: Any) -> None:
@@ -98,7 +117,12 @@ def kill_at_sync(nth: int) -> None:
 
 
 def kill_at_write(nth: int, share: float) -> None:
-    """Have this process killed when a share of its nth write is done."""
+    """Let this process be killed in the middle of a write.
+
+    Args:
+        nth: number of the write.
+        share: share of its bytes that are written.
+    """
     write_all, count = journal._write_all, 0
 
     def counting(file: FileIO, content: bytes) -> None:
@@ -113,7 +137,11 @@ def kill_at_write(nth: int, share: float) -> None:
 
 
 def workers_of(pid: int) -> list[int]:
-    """Return the worker processes of a process."""
+    """Return the worker processes of a process.
+
+    Args:
+        pid: id of the process.
+    """
     children = Path(f"/proc/{pid}/task/{pid}/children")
     found = [int(child) for child in children.read_text().split()] if children.exists() else []
     return [
@@ -124,7 +152,18 @@ def workers_of(pid: int) -> list[int]:
 def disturb(
     folder: Path, sampler: str, place: str, rng: np.random.Generator, whole_s: float
 ) -> int:
-    """Run a campaign, kill at a place, and return how it ended."""
+    """Run a campaign, and kill it.
+
+    Args:
+        folder: folder of the campaign.
+        sampler: name of the sampler.
+        place: where it is killed, as in the table above.
+        rng: random generator of the moment.
+        whole_s: seconds of an undisturbed campaign.
+
+    Returns:
+        The exit code.
+    """
     settings = settings_of(sampler)
 
     def campaign() -> None:
@@ -157,12 +196,21 @@ def disturb(
 
 
 def begin(settings: CampaignSettings, folder: Path) -> None:
-    """Run a campaign."""
+    """Run a campaign.
+
+    Args:
+        settings: its settings.
+        folder: its new folder.
+    """
     run_campaign(settings, settings.load_plan(), folder)
 
 
 def go_on(folder: Path) -> None:
-    """Go on with a campaign."""
+    """Resume a campaign.
+
+    Args:
+        folder: its folder.
+    """
     settings = settings_in(folder, read_settings(folder))
     run_campaign(settings, settings.load_plan(), folder, resumes=True)
 
@@ -184,7 +232,7 @@ def main() -> None:
             folder = Path(scratch) / sampler
             start = time.monotonic()
             if ended(forked(partial(begin, settings_of(sampler), folder))) != 0:
-                sys.exit("a campaign that nobody disturbed failed")
+                sys.exit("an undisturbed campaign failed")
             whole_s = max(whole_s, time.monotonic() - start)
             expected[sampler] = (folder / OUTCOMES).read_bytes()
         for kill in range(chosen.kills):

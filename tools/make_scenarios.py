@@ -1,7 +1,7 @@
 """Make the folders of scenarios/ again: `python tools/make_scenarios.py`.
 
 Plays each case in SUMO, writes it as a replay folder, and draws positions and speeds of all
-vehicles into `motion.png` beside it. Needs matplotlib.
+vehicles into `motion.png` next to it. Needs matplotlib.
 """
 
 from __future__ import annotations
@@ -79,7 +79,11 @@ EXAMPLES = {
 
 
 def play(example: Example) -> Trajectory:
-    """Play one example in SUMO."""
+    """Play one example in SUMO.
+
+    Args:
+        example: the example.
+    """
     scenario = example.case.scenario
     level = example.case.level
     settings = CampaignSettings(vut=example.vut, levels=(level,), scenario=scenario)
@@ -89,7 +93,13 @@ def play(example: Example) -> Trajectory:
 
 
 def draw(trajectory: Trajectory, title: str, path: Path) -> None:
-    """Draw positions and speeds of all vehicles over time."""
+    """Draw positions and speeds of all vehicles over time.
+
+    Args:
+        trajectory: the motion.
+        title: title of the picture.
+        path: file of the picture.
+    """
     figure = Figure(figsize=(9, 3.6), layout="constrained")
     left, right = figure.subplots(1, 2)
     time_s = [step * DT_S for step in range(len(trajectory.motion))]

@@ -45,7 +45,15 @@ PROBES = 48
 
 
 def make_truth(problem: Problem, folder: Path) -> KnownTruth:
-    """Run the uniform cases of a problem, write its truth into a folder, and return its entry."""
+    """Run the uniform cases of a problem, and write its truth.
+
+    Args:
+        problem: the problem.
+        folder: folder of the truths.
+
+    Returns:
+        The entry of the manifest.
+    """
     plan = problem.plan()
     arrays: dict[str, Any] = {}
     failures = {}
@@ -72,7 +80,11 @@ def make_truth(problem: Problem, folder: Path) -> KnownTruth:
 
 
 def probes_of(truth: Truth) -> tuple[Any, Any]:
-    """Return failures of a truth, and cases that pass near one that fails, (n, d) each."""
+    """Return failures of a truth, and passing cases near failures, (n, d) each.
+
+    Args:
+        truth: the truth of a level.
+    """
     failing, passing = truth.failures, truth.points[truth.margin >= 0.0]
     distance, _ = cKDTree(failing).query(passing)
     near = passing[distance <= radius_for(passing.shape[1])]

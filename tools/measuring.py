@@ -1,4 +1,4 @@
-"""What benchmarks share: a clock, medians with their spread, and `--record FILE`.
+"""Tools of all benchmarks: a clock, medians with their spread, and `--record FILE`.
 
 A record is one JSON line with the figures, the versions and the machine. Ratios on one machine
 compare from version to version; absolute times on different machines do not.
@@ -24,7 +24,11 @@ PACKAGES = ("merge-sumo", "libsumo", "numpy")
 
 
 def benchmark_parser(about: str | None) -> argparse.ArgumentParser:
-    """Return a parser with `--record FILE`, whose help is the docstring of a benchmark."""
+    """Return a parser with `--record FILE`.
+
+    Args:
+        about: docstring of the benchmark, which is the help.
+    """
     parser = argparse.ArgumentParser(
         description=about, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -35,14 +39,23 @@ def benchmark_parser(about: str | None) -> argparse.ArgumentParser:
 
 
 def seconds(work: Callable[[], object]) -> float:
-    """Return the wall-clock seconds that a function takes."""
+    """Return the wall-clock seconds of a function.
+
+    Args:
+        work: the function.
+    """
     start_s = time.perf_counter()
     work()
     return time.perf_counter() - start_s
 
 
 def spread(values: Iterable[float], digits: int = 2) -> str:
-    """Return numbers as "median [least, most]"."""
+    """Return numbers as "median [least, most]".
+
+    Args:
+        values: the numbers.
+        digits: decimals.
+    """
     known = sorted(values)
     return f"{median(known):.{digits}f} [{known[0]:.{digits}f}, {known[-1]:.{digits}f}]"
 
@@ -51,9 +64,9 @@ def append_record(file: Path | None, benchmark: str, figures: Mapping[Any, Any])
     """Append the figures of a benchmark to a file; do nothing without one.
 
     Args:
-        file: what `--record` names, begun where it does not exist.
+        file: file after `--record`, created where it does not exist.
         benchmark: name of the benchmark.
-        figures: what it measured, as JSON can hold it.
+        figures: its results, as JSON can hold them.
     """
     if file is None:
         return

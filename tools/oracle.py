@@ -41,10 +41,17 @@ def oracle(failures: Mapping[int, FloatArray], cases: int) -> FloatArray:
 
 
 def greedy_cover(points: FloatArray, most: int) -> tuple[FloatArray, FloatArray]:
-    """Return points in greedy order, (n, d) with n up to `most`, and what each adds, in balls.
+    """Order points greedily by the coverage that they add.
 
-    What a point adds never grows. So the best is one that still adds as much as it once did, if no
-    other one ever did more (Minoux, 1978); of points that add the same it is the first.
+    The added coverage of a point never grows. So the best point is one that still adds its earlier
+    value, if no other earlier value is larger (Minoux, 1978); of equal points it is the first.
+
+    Args:
+        points: points of the unit cube, (m, d).
+        most: largest number of points.
+
+    Returns:
+        Points in greedy order, (n, d), and the added coverage of each in balls, (n,).
     """
     grid = CoverageGrid(points.shape[1])
     queue = [(-1.0, place) for place in range(len(points))]

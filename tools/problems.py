@@ -100,7 +100,7 @@ class KnownTruth(Record, frozen=True):
         cases: uniform cases of each level.
         failures: failures that the file has, by level.
         fmc: FMC of these, by level.
-        growth: share that as many further cases could add to it at most, by level.
+        growth: largest share that the same number of further cases could add to it, by level.
         versions: software with which it was made.
     """
 
@@ -149,26 +149,40 @@ class ProblemTruth:
     probes: dict[int, ProbeCases]
 
     def share(self, found_fmc: float) -> float:
-        """Return the share of the FMC that was found, 1 at most.
+        """Return the share of the FMC that was found, at most 1.
 
-        A search may fail where the truth's cases have missed: that gives no more than the truth.
+        A search may fail where no case of the truth does: that gives no more than the truth.
+
+        Args:
+            found_fmc: FMC of the failures that were found, summed over the levels.
         """
         return min(1.0, found_fmc / self.fmc)
 
     def oracle_cases_to(self, share: float) -> int | None:
-        """Return the cases that the oracle needs to a share of the FMC; None for more than 400."""
+        """Return the cases that the oracle needs to a share of the FMC; None for more than 400.
+
+        Args:
+            share: the share, from 0 to 1.
+        """
         reached = np.flatnonzero(self.oracle >= share * self.fmc)
         return int(reached[0]) if len(reached) else None
 
 
 def named_problems(names: Iterable[str]) -> tuple[Problem, ...]:
-    """Return the problems of these names; `UserError` for an unknown name."""
+    """Return problems.
+
+    Args:
+        names: their names.
+
+    Raises:
+        UserError: a name is unknown.
+    """
     known = {problem.name: problem for problem in PROBLEMS}
     once = dict.fromkeys(names)
     for name in once:
         if name not in known:
             raise UserError(
-                f"--problems: there is no problem {name!r}: {meant(name, known)}choose from "
+                f"--problems: unknown problem {name!r}: {meant(name, known)}choose from "
                 f"{', '.join(known)}"
             )
     return tuple(known[name] for name in once)
@@ -176,14 +190,23 @@ def named_problems(names: Iterable[str]) -> tuple[Problem, ...]:
 
 @cache
 def manifest(folder: Path = TRUTHS) -> Manifest:
-    """Return the manifest of a folder of truths, empty where there is none."""
+    """Return the manifest of a folder of truths, empty where it has none.
+
+    Args:
+        folder: the folder.
+    """
     return read_record(folder / MANIFEST, Manifest) or Manifest({})
 
 
 def shipped_truth(problem: Problem, folder: Path = TRUTHS) -> ProblemTruth:
     """Return the truth of a problem.
 
-    Raises `UserError` where its file is missing, or is not the one of the manifest.
+    Args:
+        problem: the problem.
+        folder: folder of the truths.
+
+    Raises:
+        UserError: its file is missing, or is not the one of the manifest.
     """
     path = folder / f"{problem.name}.npz"
     known = manifest(folder).truths.get(problem.name)

@@ -1,4 +1,4 @@
-"""Print the commands of the site and of README, so that CI runs what a person reads: one per line.
+"""Print the commands of the site and of README, one per line: CI runs them.
 
 python tools/readme_commands.py            all commands in ```sh blocks, in order
 python tools/readme_commands.py "Install"  only those under that heading
@@ -26,7 +26,12 @@ def pages() -> list[Path]:
 
 
 def commands(text: str, heading: str | None = None) -> list[str]:
-    """Return the commands in ```sh blocks, without comments, of all headings or of one."""
+    """Return the commands in ```sh blocks, without comments.
+
+    Args:
+        text: a page.
+        heading: heading of the blocks; None for all.
+    """
     found: list[str] = []
     current, in_block = "", False
     for line in text.splitlines():

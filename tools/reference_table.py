@@ -38,7 +38,13 @@ HEAD = (
 
 
 def row(vut: str, cases: int, workers: int | None) -> str:
-    """Run uniform cases at each level and return the line of the table."""
+    """Run uniform cases at each level, and return the line of the table.
+
+    Args:
+        vut: spec of the VUT.
+        cases: cases at each level.
+        workers: number of processes; None for one a core.
+    """
     failures, timeouts, coverage, known, times = [], 0, [], 0, []
     avoided = dict.fromkeys(("careful", TAKES_OVER), 0)
     with tempfile.TemporaryDirectory() as folder:

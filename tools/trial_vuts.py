@@ -20,12 +20,20 @@ CRUISE_MPS = 28.0
 
 
 def profile(v_mps: FloatArray) -> FloatArray:
-    """Return the acceleration towards the cruising speed."""
+    """Return the acceleration towards the cruising speed.
+
+    Args:
+        v_mps: speeds of the VUT, (K,).
+    """
     return np.clip((CRUISE_MPS - v_mps) / DT_S, 0.0, 1.0)
 
 
 def gap_at_merge(seen: Any) -> FloatArray:
-    """Return the gap at M if the POV keeps its speed and the VUT goes on as it does."""
+    """Return the gap at M if the POV keeps its speed and the VUT follows the profile.
+
+    Args:
+        seen: the observation, with arrays of (K,).
+    """
     time_s = np.maximum(-seen.x_vut_m, 0.0) / np.maximum(seen.v_vut_mps, 1.0)
     gap: FloatArray = seen.x_pov_m + seen.v_pov_mps * time_s
     return gap
@@ -66,7 +74,7 @@ class Hysteresis:
 
 
 class Delayed:
-    """Plans on what it saw 0.8 s ago: the acceleration of three with the largest gap at M."""
+    """Takes the acceleration of three with the largest gap at M, by the state 0.8 s ago."""
 
     DELAY = 8
 
@@ -93,7 +101,7 @@ class Delayed:
 
 
 class SlowerDelayed(Delayed):
-    """The same on what it saw 1 s ago: a version that reacts more slowly."""
+    """The same by the state 1 s ago: a version that reacts more slowly."""
 
     DELAY = 10
 
@@ -162,7 +170,7 @@ class Noisy:
 
 
 class Hidden:
-    """Commits at a moment that follows from its first sight, in a way that nobody can see."""
+    """Commits at a moment that depends on the first state irregularly."""
 
     def __init__(self, corridors: int) -> None:
         """Prepare for K corridors."""

@@ -1,4 +1,4 @@
-"""Weigh the package and the tests: tokens of each room and frames of the stack, against a budget.
+"""Compare tokens of each room and frames of the stack with a budget.
 
     python tools/weight.py            print the table; end with 1 where a room is above its budget
     python tools/weight.py --lower    write today's weights as the budget; the sums only go down
@@ -39,13 +39,21 @@ Weights = dict[str, int]
 
 
 def weight_of(path: Path) -> int:
-    """Return the tokens of a file."""
+    """Return the tokens of a file.
+
+    Args:
+        path: the file.
+    """
     with path.open("rb") as file:
         return sum(token.type not in LAYOUT for token in tokenize.tokenize(file.readline))
 
 
 def room_of(path: Path) -> str:
-    """Return the folder below the package or the tests in which a file stands."""
+    """Return the folder of a file below the package or the tests.
+
+    Args:
+        path: path of the file in the checkout.
+    """
     return "/".join(path.parts[: min(2, len(path.parts) - 1)])
 
 

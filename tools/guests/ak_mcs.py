@@ -33,7 +33,7 @@ class AkMcsSampler(LevelwiseSampler):
     Kriging and Monte Carlo Simulation" (2011), with a Matern kernel, as for a rough limit state.
     A batch is chosen one point at a time: the process then believes its own mean there (kriging
     believer). Where no point of the population is uncertain any more, the method would stop; the
-    sampler then goes on where the deviation is largest, in half of the batches among the points
+    sampler then continues where the deviation is largest, in half of the batches among the points
     that are to fail, in the others anywhere.
 
     The limit state is sqrt|dx| - sqrt(6 m), with the gap dx at M, negative where a case fails: the
@@ -131,7 +131,7 @@ def _fitted(points: FloatArray, values: FloatArray) -> _Process:
     dims = points.shape[1]
     kernel = ot.MaternModel([0.3] * dims, [1.0], 2.5)
     kernel.setNuggetFactor(NUGGET)
-    # Cobyla says where it stops early; what it has then is good enough.
+    # Cobyla reports where it stops early; its result is good enough then.
     ot.Log.Show(ot.Log.NONE)
     fitter = ot.GaussianProcessFitter(
         ot.Sample(points), ot.Sample(values[:, None]), kernel, ot.ConstantBasisFactory(dims).build()

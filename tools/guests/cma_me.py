@@ -30,9 +30,9 @@ class CmaMeSampler(LevelwiseSampler):
     Space" (2020). The measures of the archive are the coordinates of the start, so that it keeps
     the worst case of each cell of the pool.
 
-    A scheduler of the library keeps a random state, and a sampler is to be pure in what it was
-    told. So the search is replayed for each batch: it is asked for the sizes of all batches of the
-    past, and told what they gave.
+    A scheduler of the library keeps a random state, and a sampler is a pure function of its
+    outcomes. So the search is replayed for each batch: it is asked for earlier batches, and told
+    their results.
     """
 
     about = "fills an archive of starts by evolution strategies (pyribs, CMA-ME)"
@@ -83,7 +83,7 @@ class Illumination:
     """
 
     def __init__(self, dims: int, seed: Sequence[int], first: int) -> None:
-        """Prepare a search whose first batch has so many points; it sets the generations' size."""
+        """Prepare a search; the size of its first batch is that of the generations."""
         from ribs.archives import GridArchive
         from scipy.stats.qmc import Sobol
 
