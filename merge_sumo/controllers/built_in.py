@@ -6,7 +6,7 @@ from dataclasses import asdict, replace
 from importlib import import_module
 from pkgutil import iter_modules
 
-from merge_sumo.controllers.spec import ControllerKind, ControllerOptions, ControllerSpec
+from merge_sumo.controllers.spec import ControllerKind
 from merge_sumo.drivers import __name__ as room
 from merge_sumo.drivers import __path__ as folders
 from merge_sumo.drivers.base import BuiltInVut, Driver
@@ -29,17 +29,13 @@ class BuiltInKind(ControllerKind):
 
     own_code = asks_sumo = False
 
-    def __init__(self, spec: ControllerSpec, options: ControllerOptions) -> None:
+    def load(self) -> None:
         """Take the parameters.
-
-        Args:
-            spec: a name of `BUILT_IN_VUTS` and parameters.
-            options: how it is hosted.
 
         Raises:
             UserError: for a parameter or a value that it cannot have.
         """
-        super().__init__(spec, options)
+        spec = self.spec
         self._built_in = built_in = BUILT_IN_VUTS[spec.argument]
         self._design = built_in.design
         self.settable = settable = {} if self._design is None else asdict(self._design)

@@ -22,7 +22,7 @@ import numpy as np
 
 from merge_sumo.controllers.controller import ControllerDriver, Start
 from merge_sumo.controllers.deadline import Deadline, text_of
-from merge_sumo.controllers.process import connected
+from merge_sumo.controllers.process import parent_connection
 from merge_sumo.controllers.spec import ControllerKind, ControllerOptions, ControllerSpec
 from merge_sumo.drivers.base import ControllerDiedError, Scene
 from merge_sumo.errors import ControllerError, UserError
@@ -101,7 +101,7 @@ def main(settings: Mapping[str, Any]) -> None:
     # Workers block Ctrl-C, and processes that they start inherit it.
     signal.pthread_sigmask(signal.SIG_SETMASK, ())
     signal.signal(signal.SIGINT, signal.default_int_handler)
-    connection = connected(settings, RLIMIT_DATA=int(settings["memory_gib"] * 2**30))
+    connection = parent_connection(settings, RLIMIT_DATA=int(settings["memory_gib"] * 2**30))
     with suppress(EOFError):
         _Host(connection, settings).serve()
 
@@ -142,7 +142,7 @@ class _Host:
     def _load(self, _request: HostRequest) -> HostReply:
         settings = self._settings
         spec = msgspec.convert(settings["spec"], ControllerSpec)
-        options = ControllerOptions(deadline_s=settings["deadline_s"], in_process=True)
+        options = ControllerOptions(deadline_s=settings["deadline_s"])
         self._kind = kind = named(settings["kind"])(spec, options)
         return HostReply(max_corridors=kind.max_corridors, files=self._files())
 

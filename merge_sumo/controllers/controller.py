@@ -10,7 +10,7 @@ from typing import Any, NamedTuple, Self
 import msgspec
 import numpy as np
 
-from merge_sumo.controllers.deadline import Deadline, closed, text_of
+from merge_sumo.controllers.deadline import Deadline, close_within, text_of
 from merge_sumo.drivers.base import MERGE, NO_REQUEST, STAY, Driver, Scene
 from merge_sumo.drivers.car_following import conflicting_car
 from merge_sumo.scenario.case import Case, FloatArray
@@ -225,6 +225,29 @@ class Controller:
 class ControllerDriver(Driver):
     """A driver that learns of an episode only its start, so that it can run in another process."""
 
+    def __init__(self, corridors: int) -> None:
+        """Prepare for corridors 0 to `corridors` - 1.
+
+        Args:
+            corridors: number of corridors.
+        """
+        super().__init__(corridors)
+        self._reasons: dict[int, str] = {}
+        """Errors of controllers by corridor."""
+        self._signals: dict[int, StepSignals] = {}
+
+    def reason(self, corridor: int) -> str | None:
+        """Return the error of the controller of a corridor; None without one.
+
+        Args:
+            corridor: index of the corridor.
+        """
+        return self._reasons.get(corridor)
+
+    def signals(self) -> Mapping[int, StepSignals]:
+        """Return the signals of the last answers, by corridor."""
+        return self._signals
+
     def begin(self, corridor: int, case: Case) -> None:
         """Begin an episode of a case.
 
@@ -267,9 +290,7 @@ class ControllerArray(ControllerDriver):
         super().__init__(corridors)
         self._new, self._deadline = new, Deadline(deadline_s)
         self._controllers: list[Controller] = []
-        self._reasons: list[str | None] = [None] * corridors
         self._replace = [False] * corridors
-        self._signals: dict[int, StepSignals] = {}
         self._lanes_m: list[Bounds | None] = [None] * corridors
         for _ in range(corridors):
             self._controllers.append(new())
@@ -281,7 +302,8 @@ class ControllerArray(ControllerDriver):
             corridor: index of the corridor.
             start: first observation of the episode.
         """
-        self._reasons[corridor], self._lanes_m[corridor] = None, start.lane_m
+        self._reasons.pop(corridor, None)
+        self._lanes_m[corridor] = start.lane_m
         is_new = self._replace[corridor]
         if is_new:
             self._close(corridor)
@@ -315,7 +337,7 @@ class ControllerArray(ControllerDriver):
         with self._deadline as deadline:
             for k in np.flatnonzero(scene.active).tolist():
                 answers[k] = math.nan
-                if self._reasons[k] is not None:
+                if k in self._reasons:
                     continue
                 try:
                     controller, t_s = self._controllers[k], round(steps[k] * DT_S, 1)
@@ -334,18 +356,6 @@ class ControllerArray(ControllerDriver):
         self._merge_requests = np.array(merge_requests, dtype=np.int8) if chooses else None
         return np.array(answers)
 
-    def reason(self, corridor: int) -> str | None:
-        """Return the error of the controller of a corridor; None without one.
-
-        Args:
-            corridor: index of the corridor.
-        """
-        return self._reasons[corridor]
-
-    def signals(self) -> Mapping[int, StepSignals]:
-        """Return the signals of the last answers, by corridor."""
-        return self._signals
-
     def parameters(self) -> Mapping[str, float]:
         """Return the parameters of the first controller."""
         return self._controllers[0].parameters()
@@ -356,7 +366,7 @@ class ControllerArray(ControllerDriver):
             self._close(corridor)
 
     def _close(self, corridor: int) -> None:
-        closed(self._deadline.deadline_s, self._controllers[corridor].close)
+        close_within(self._deadline.deadline_s, self._controllers[corridor].close)
 
     def _fail(self, corridor: int, reason: str) -> None:
         self._reasons[corridor], self._replace[corridor] = reason, True

@@ -52,6 +52,11 @@ class Deadline:
     before_call: ClassVar[Callable[[float], None] | None] = None
 
     def __init__(self, deadline_s: float) -> None:
+        """Time no call yet.
+
+        Args:
+            deadline_s: time for a call.
+        """
         self.deadline_s, self._since_s = deadline_s, math.inf
         self._is_timed = False
 
@@ -96,7 +101,7 @@ class Deadline:
         """Return the error of a call in words, with file and line; Ctrl-C is raised again.
 
         Args:
-            error: what the call raised.
+            error: the error that the call raised.
         """
         self._since_s = math.inf
         if isinstance(error, (Stopped, KeyboardInterrupt)) and Deadline.before_call is None:
@@ -106,14 +111,14 @@ class Deadline:
         if isinstance(error, BdbQuit):
             return "a debugger was left; breakpoints work with `merge-sumo run --debug`"
         name = text_of(error, lambda error: type(error).__name__)
-        return f"{name}: {text_of(error)}{text_of(error, _place)}"
+        return f"{name}: {text_of(error)}{text_of(error, _raised_at)}"
 
     def _ring(self, _signal: int, _frame: FrameType | None) -> None:
         if perf_counter() - self._since_s > self.deadline_s:
             raise DeadlineExceeded
 
 
-def closed(deadline_s: float, close: Callable[[], Any]) -> None:
+def close_within(deadline_s: float, close: Callable[[], Any]) -> None:
     """Call a controller's `close` within the deadline; an error is printed and changes nothing.
 
     Args:
@@ -144,7 +149,7 @@ def text_of(thing: object, as_text: Callable[[Any], str] = str) -> str:
         return f"({type(error).__name__} when it was to be shown)"
 
 
-def _place(error: BaseException) -> str:
+def _raised_at(error: BaseException) -> str:
     """Return where an error was raised, " (FILE, line N)"; "" for an error of this package."""
     last: TracebackType | None = error.__traceback__
     while last is not None and last.tb_next is not None:  # a recursion leaves thousands

@@ -9,7 +9,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from merge_sumo.controllers.controller import Controller, Seen, Start, as_merge
-from merge_sumo.controllers.spec import ControllerOptions, ControllerSpec, FileKind
+from merge_sumo.controllers.spec import FileKind
 from merge_sumo.errors import UserError
 from merge_sumo.printable import either
 from merge_sumo.scenario.scenario import DT_S
@@ -47,17 +47,13 @@ class FmuKind(FileKind):
     library = "fmpy"
     names = (*INPUTS, OUTPUT, REACHED, MERGE, SEED)
 
-    def __init__(self, spec: ControllerSpec, options: ControllerOptions) -> None:
+    def load(self) -> None:
         """Read the description of the unit.
-
-        Args:
-            spec: the file, and the names of its variables.
-            options: how it is hosted.
 
         Raises:
             UserError: if it cannot be read, or cannot drive.
         """
-        super().__init__(spec, options)
+        super().load()
         path = self.path
         try:
             self._description = self.api.read_model_description(str(path))
@@ -135,10 +131,10 @@ class FmuKind(FileKind):
         elif variable is None:
             names = ", ".join(sorted(self._variables)[:12])
             raise UserError(f"{self.path} has no variable {name!r}; it has {names}")
-        if variable.type not in types or variable.dimensions:
-            kind = "an array" if variable.dimensions else f"a {variable.type}"
+        if variable.type not in types:
             raise UserError(
-                f"the variable {name!r} of {self.path} is {kind}: it must be a {either(types)}"
+                f"the variable {name!r} of {self.path} is a {variable.type}: it must be a "
+                f"{either(types)}"
             )
         return variable
 

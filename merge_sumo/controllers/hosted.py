@@ -21,13 +21,13 @@ from merge_sumo.controllers.spec import ControllerKind, ControllerOptions, Contr
 from merge_sumo.drivers.base import ControllerDiedError, Driver, Scene
 from merge_sumo.errors import ControllerError, UserError
 from merge_sumo.scenario.case import FloatArray
-from merge_sumo.scenario.signals import StepSignals, valid_signals
+from merge_sumo.scenario.signals import valid_signals
 
 SUPPORTED = os.name == "posix"
 """Elsewhere a controller runs in this process."""
-GRACE = 1.5
+GRACE_FACTOR = 1.5
 GRACE_S = 1.25
-"""A process that has sent nothing for GRACE deadlines and GRACE_S seconds is killed: by then it
+"""A process that sends nothing for GRACE_FACTOR deadlines and GRACE_S seconds is killed: by then it
 should have ended the call by itself."""
 
 
@@ -53,7 +53,7 @@ class ControllerProcess(ChildProcess):
             UserError: if the controller cannot be loaded.
         """
         self._spec, self._connect_s = spec, options.connect_s
-        self._patience_s = GRACE * options.deadline_s + GRACE_S
+        self._patience_s = GRACE_FACTOR * options.deadline_s + GRACE_S
         self._late = f"took longer than the deadline of {options.deadline_s:g} s"
         settings = {
             "kind": f"{kind.__module__}:{kind.__qualname__}",
@@ -227,7 +227,6 @@ class HostedDriver(ControllerDriver):
         super().__init__(corridors)
         self._kind = kind
         self._starts: list[tuple[int, Start]] = []
-        self._reply = HostReply()
         self._files: set[Path] = set()
         self._process = self._opened()
 
@@ -254,10 +253,13 @@ class HostedDriver(ControllerDriver):
         try:
             if not self._process.alive:
                 self._process = self._opened()
-            self._reply = reply = self._process.request(request)
+            reply = self._process.request(request)
         except (ProcessDiedError, UserError) as error:
             raise ControllerDiedError(str(error)) from None
         self._files.update(paths_of(reply))
+        self._reasons, self._signals = reply.reasons, {}
+        for corridor, left in reply.signals.items():
+            self._signals[corridor] = valid_signals(left)  # the process may send any text
         answers, merge_requests = np.array(reply.accelerations_mps2), None
         if reply.merge_requests is not None:
             merge_requests = np.array(reply.merge_requests, dtype=np.int8)
@@ -268,25 +270,9 @@ class HostedDriver(ControllerDriver):
         self._merge_requests = merge_requests
         return answers
 
-    def signals(self) -> Mapping[int, StepSignals]:
-        """Return the signals of the last answers, by corridor."""
-        # The process may send any text: it is bounded again.
-        signals: dict[int, StepSignals] = {}
-        for corridor, left in self._reply.signals.items():
-            signals[corridor] = valid_signals(left)
-        return signals
-
     def parameters(self) -> Mapping[str, float]:
         """Return the parameters of the first controller, as they were when it was made."""
         return self._parameters
-
-    def reason(self, corridor: int) -> str | None:
-        """Return the error of the controller of a corridor; None without one.
-
-        Args:
-            corridor: index of the corridor.
-        """
-        return self._reply.reasons.get(corridor)
 
     def files(self) -> tuple[Path, ...]:
         """Return the files of code that were loaded so far."""

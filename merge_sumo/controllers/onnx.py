@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from merge_sumo.controllers.controller import Controller, Seen, Start, as_merge
-from merge_sumo.controllers.spec import ControllerOptions, ControllerSpec, FileKind
+from merge_sumo.controllers.spec import FileKind
 from merge_sumo.drivers.levelk import ACTIONS, actions_mps2
 from merge_sumo.errors import UserError
 from merge_sumo.scenario.scenario import DT_S
@@ -43,17 +43,13 @@ class OnnxKind(FileKind):
     library = "onnxruntime"
     names = (PERIOD,)
 
-    def __init__(self, spec: ControllerSpec, options: ControllerOptions) -> None:
+    def load(self) -> None:
         """Load the network.
-
-        Args:
-            spec: the file and its parameters.
-            options: how it is hosted.
 
         Raises:
             UserError: if it cannot be loaded, or cannot drive.
         """
-        super().__init__(spec, options)
+        super().load()
         # One thread: answers must not depend on the cores of the machine.
         settings = self.api.SessionOptions()
         settings.intra_op_num_threads = settings.inter_op_num_threads = 1

@@ -112,7 +112,7 @@ def append(log: Path, content: bytes) -> None:
 
     Args:
         log: the file; a link, a pipe or a folder in its place is left alone.
-        content: what is added.
+        content: bytes to add.
 
     Raises:
         OSError: if it cannot be written.
@@ -124,8 +124,8 @@ def append(log: Path, content: bytes) -> None:
             file.write(content)
 
 
-class Started:
-    """A process in a group of its own.
+class LoggedProcess:
+    """A process in a group of its own, with its output in a log.
 
     Attributes:
         output: its standard output and standard error.
@@ -175,7 +175,7 @@ class Started:
 
 
 BROKEN = "broke the channel to its process"
-"""The reason of a process that closes its connection, or sends what is not a reply."""
+"""The reason of a process that closes its connection, or sends an invalid reply."""
 
 
 class ProcessDiedError(Exception):
@@ -196,7 +196,7 @@ class ProcessDiedError(Exception):
         self.hung = hung
 
 
-class ChildProcess(Started):
+class ChildProcess(LoggedProcess):
     """A Python process that answers messages, and ends with this process.
 
     Attributes:
@@ -216,7 +216,7 @@ class ChildProcess(Started):
         """Start a process.
 
         Args:
-            main: "MODULE:FUNCTION" of this package, which gets its connection by `connected`.
+            main: "MODULE:FUNCTION" of this package; `parent_connection` gives it its connection.
             settings: argument of the function.
             environment: environment variables of the process.
             log: file to which its output is added; None shows it.
@@ -319,7 +319,7 @@ class ChildProcess(Started):
         return ProcessDiedError(f"ended its process by signal {-code} ({name})")
 
 
-def connected(settings: Mapping[str, Any], **limits: int) -> Connection:
+def parent_connection(settings: Mapping[str, Any], **limits: int) -> Connection:
     """Return the connection of a process that a `ChildProcess` started, in that process.
 
     Args:
@@ -347,10 +347,11 @@ def split_command(command: str) -> list[str]:
         arguments = shlex.split(command)
     except ValueError as error:
         raise UserError(f"the command {command!r} cannot be read: {error}") from error
-    if not arguments or shutil.which(arguments[0]) is None:
+    program = arguments[0] if arguments else ""
+    if shutil.which(program) is None:
         raise UserError(
-            f"the command {command!r}: there is no program {(arguments or [''])[0]!r}; write it as "
-            "you would in a terminal"
+            f"the command {command!r}: there is no program {program!r}; write it as you would in a "
+            "terminal"
         )
     return arguments
 
@@ -358,8 +359,8 @@ def split_command(command: str) -> list[str]:
 def code_of(arguments: Sequence[str]) -> tuple[Path, ...]:
     """Return the file of code that a command runs, or nothing where it is not known.
 
-    That is the first file that is no program of this machine, as an interpreter is. Other files may
-    be data, which the command reads and writes.
+    It is the first file that is not a program of this machine, as an interpreter is. Other files
+    may be data, which the command reads and writes.
 
     Args:
         arguments: the command.
@@ -373,7 +374,7 @@ def code_of(arguments: Sequence[str]) -> tuple[Path, ...]:
     return ()
 
 
-class Program(Started):
+class Program(LoggedProcess):
     """A running program of the user's."""
 
     def __init__(self, arguments: list[str], port: int, log: Path | None) -> None:
@@ -387,12 +388,9 @@ class Program(Started):
         Raises:
             UserError: if it cannot be started.
         """
-        super().__init__(
-            f"the command {arguments[0]!r}",
-            [argument.replace("{port}", str(port)) for argument in arguments],
-            log,
-            env={**os.environ, "MERGE_SUMO_PORT": str(port)},
-        )
+        command = [argument.replace("{port}", str(port)) for argument in arguments]
+        environment = {**os.environ, "MERGE_SUMO_PORT": str(port)}
+        super().__init__(f"the command {arguments[0]!r}", command, log, env=environment)
 
     def ended(self, patience_s: float) -> str:
         """Return how it ended and the last line that it printed; "" when it still runs.

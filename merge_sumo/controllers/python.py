@@ -25,7 +25,7 @@ from merge_sumo.controllers.controller import (
     Start,
     WrongAnswerError,
 )
-from merge_sumo.controllers.deadline import Deadline, closed, text_of
+from merge_sumo.controllers.deadline import Deadline, close_within, text_of
 from merge_sumo.controllers.signatures import (
     attributes_of,
     check_call,
@@ -33,10 +33,10 @@ from merge_sumo.controllers.signatures import (
     defaults_of,
     fits,
     is_code,
-    number_of,
+    numbers_of,
     takes_seed,
 )
-from merge_sumo.controllers.spec import HERE, ControllerKind, ControllerOptions, ControllerSpec
+from merge_sumo.controllers.spec import HERE, ControllerKind, ControllerSpec
 from merge_sumo.drivers.base import MERGE, NO_REQUEST, STAY, ControllerDiedError, Driver, Scene
 from merge_sumo.errors import ControllerError, UserError
 from merge_sumo.files import check_code
@@ -78,17 +78,12 @@ class OfPython(ControllerKind):
 
     asks_sumo = False
 
-    def __init__(self, spec: ControllerSpec, options: ControllerOptions) -> None:
+    def load(self) -> None:
         """Check the target and the parameters.
-
-        Args:
-            spec: names the target, and its parameters.
-            options: how it is hosted.
 
         Raises:
             UserError: if it cannot be called as a VUT, or has no such parameter.
         """
-        super().__init__(spec, options)
         self._target = target = self.target()
         self._is_function, self._is_class = inspect.isroutine(target), isinstance(target, type)
         if self._is_function:
@@ -100,21 +95,18 @@ class OfPython(ControllerKind):
         if not acts and (self._is_class or not callable(target) or not fits(target, 1)):
             raise self.refused(target)
         # An observation, or the number of corridors, is positional.
-        by_place = int(not self._is_class or self._is_batched)
-        defaults = defaults_of(target, by_place)
+        positional = int(not self._is_class or self._is_batched)
+        defaults = defaults_of(target, positional)
         self._keywords: dict[str, float] = {}
         self._attributes: dict[str, float] = {}
-        for name, value in spec.numbers().items():
+        for name, value in self.spec.numbers().items():
             if name in defaults:
                 self._keywords[name] = value
             elif self._is_function:
-                raise spec.unknown_parameter(name, defaults)
+                raise self.spec.unknown_parameter(name, defaults)
             else:
                 self._attributes[name] = value
-        self._numbers: dict[str, float] = {}
-        for name, value in (defaults | self._keywords).items():
-            if (number := number_of(value)) is not None:
-                self._numbers[name] = number
+        self._numbers = numbers_of(defaults | self._keywords)
 
     def target(self) -> Any:
         """Return the class, function or object.
@@ -202,16 +194,16 @@ class PythonKind(OfPython):
         """Return the class or function that the spec names."""
         return self.code_at(self.spec.argument)
 
-    def code_at(self, place: str) -> Any:
+    def code_at(self, reference: str) -> Any:
         """Return a class or function, and note its file.
 
         Args:
-            place: MODULE:NAME or FILE.py:NAME.
+            reference: MODULE:NAME or FILE.py:NAME.
 
         Raises:
             UserError: if the module cannot be loaded, or has no such class or function.
         """
-        source, _, name = place.rpartition(":")
+        source, _, name = reference.rpartition(":")
         module = _module_of(source)
         target: Any = module
         for part in name.split("."):
@@ -320,8 +312,6 @@ class BatchedVut(ControllerDriver):
         self._kind, self._deadline = kind, Deadline(kind.options.deadline_s)
         self._object = kind.make(corridors)
         self._replace = False
-        self._errors: dict[int, str] = {}
-        """By corridor: why its reset or the last act failed, or its merge request is invalid."""
         self._lanes_m = np.zeros((2, corridors))
 
     def reset(self, corridor: int, start: Start) -> None:
@@ -333,7 +323,7 @@ class BatchedVut(ControllerDriver):
             corridor: index of the corridor.
             start: first observation of the episode.
         """
-        self._errors.pop(corridor, None)
+        self._reasons.pop(corridor, None)
         self._lanes_m[:, corridor] = start.lane_m or (0.0, 0.0)
         try:
             with self._deadline as deadline:
@@ -343,7 +333,7 @@ class BatchedVut(ControllerDriver):
                 _reset(self._object, corridor, start.seen, seed=start.seed)
                 deadline.stop()
         except BaseException as error:
-            self._errors[corridor] = f"reset: {self._deadline.reason(error)}"
+            self._reasons[corridor] = f"reset: {self._deadline.reason(error)}"
 
     def act(self, scene: Scene) -> FloatArray:
         """Call `act_batch` on a copy of the scene.
@@ -374,13 +364,13 @@ class BatchedVut(ControllerDriver):
             running = np.flatnonzero(scene.active).tolist()
             if len(running) > 1:
                 raise ControllerDiedError(reason) from None
-            self._errors = dict.fromkeys(running, reason) | self._errors
+            self._reasons = dict.fromkeys(running, reason) | self._reasons
             return np.full(k, np.nan)
         answer = answer.astype(np.float64)
         if answer.ndim == 2:
             answer, requests = answer
             self._take_requests(requests, scene.active)
-        answer[list(self._errors)] = np.nan
+        answer[list(self._reasons)] = np.nan
         return answer
 
     def _take_requests(self, requests: FloatArray, active: NDArray[np.bool_]) -> None:
@@ -389,23 +379,15 @@ class BatchedVut(ControllerDriver):
         self._merge_requests = np.where(active & known, requests, NO_REQUEST).astype(np.int8)
         for corridor in np.flatnonzero(active & ~known).tolist():
             wrong = f"requests {requests[corridor]} instead of 1 or 0, to merge or not"
-            self._errors.setdefault(corridor, wrong)
+            self._reasons.setdefault(corridor, wrong)
 
     def parameters(self) -> Mapping[str, float]:
         """Return the parameters of the object."""
         return self._kind.present(self._object)
 
-    def reason(self, corridor: int) -> str | None:
-        """Return the error of a corridor; None without one.
-
-        Args:
-            corridor: index of the corridor.
-        """
-        return self._errors.get(corridor)
-
     def close(self) -> None:
         """Call `close`, if the object has it."""
-        closed(self._deadline.deadline_s, partial(_close, self._object))
+        close_within(self._deadline.deadline_s, partial(_close, self._object))
 
 
 @dataclass(frozen=True, slots=True)
@@ -492,8 +474,12 @@ def _close(thing: Any) -> None:
 def _reset(thing: Any, *arguments: Any, seed: int) -> None:
     """Call `reset` of an object that has it, with the seed of the episode where it takes one."""
     reset = getattr(thing, "reset", None)
-    if reset is not None:
-        reset(*arguments, **({"seed": seed} if takes_seed(reset) else {}))
+    if reset is None:
+        return
+    if takes_seed(reset):
+        reset(*arguments, seed=seed)
+    else:
+        reset(*arguments)
 
 
 def _module_of(source: str) -> ModuleType:

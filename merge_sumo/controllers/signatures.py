@@ -80,7 +80,7 @@ def check_call(function: Callable[..., Any], arguments: tuple[str, ...]) -> None
         return
     parameters = ", ".join(_parameters(function))
     called = f"{name}({parameters}) is called as {name}({', '.join(arguments)})"
-    raise UserError(printable(f"{_place(function)}{called}"))
+    raise UserError(printable(f"{_defined_at(function)}{called}"))
 
 
 def fits(function: Callable[..., Any], count: int, *, seeded: bool = False) -> bool:
@@ -101,24 +101,25 @@ def fits(function: Callable[..., Any], count: int, *, seeded: bool = False) -> b
     return True
 
 
-def _place(function: Callable[..., Any]) -> str:
+def _defined_at(function: Callable[..., Any]) -> str:
     """Return "FILE:LINE: " of a function; "" for one that is not written in Python."""
     code = getattr(inspect.unwrap(function), "__code__", None)
     if code is None:
         return ""
-    return f"{code.co_filename.removeprefix(f'{Path.cwd()}/')}:{code.co_firstlineno}: "
+    file = code.co_filename.removeprefix(f"{Path.cwd()}/")
+    return f"{file}:{code.co_firstlineno}: "
 
 
-def defaults_of(target: Any, by_place: int) -> dict[str, Any]:
+def defaults_of(target: Any, positional: int) -> dict[str, Any]:
     """Return the keywords of a class or function with their defaults; {} for another object.
 
     Args:
         target: the class, function or object.
-        by_place: number of first arguments that are positional in a call.
+        positional: number of first arguments that are positional in a call.
     """
     defaults: dict[str, Any] = {}
     if is_code(target):
-        for parameter in list(_parameters(target).values())[by_place:]:
+        for parameter in list(_parameters(target).values())[positional:]:
             if parameter.kind in (Parameter.POSITIONAL_OR_KEYWORD, Parameter.KEYWORD_ONLY):
                 defaults[parameter.name] = parameter.default
     return defaults
@@ -130,24 +131,25 @@ def attributes_of(made: Any) -> dict[str, float]:
     Args:
         made: the object.
     """
-    found: dict[str, float] = {}
+    values: dict[str, Any] = {}
     for name in sorted(object.__dir__(made)):
         value = inspect.getattr_static(made, name, None)
         if isinstance(value, MemberDescriptorType):  # of __slots__
             value = getattr(made, name, None)
-        number = number_of(value)
-        if number is not None and not name.startswith("_"):
-            found[name] = number
-    return found
+        if not name.startswith("_"):
+            values[name] = value
+    return numbers_of(values)
 
 
-def number_of(value: Any) -> float | None:
-    """Return a value as a number of Python; None unless it is a finite number.
+def numbers_of(values: Mapping[str, Any]) -> dict[str, float]:
+    """Return the values that are finite numbers, as numbers of Python, by name.
 
     Args:
-        value: any object.
+        values: any objects by name.
     """
-    if isinstance(value, bool) or not isinstance(value, int | float | np.integer | np.floating):
-        return None
-    number = value.item() if isinstance(value, np.generic) else value
-    return number if math.isfinite(number) else None
+    numbers: dict[str, float] = {}
+    for name, value in values.items():
+        number = value.item() if isinstance(value, np.number) else value
+        if type(number) in (int, float) and math.isfinite(number):
+            numbers[name] = number
+    return numbers

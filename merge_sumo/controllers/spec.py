@@ -175,9 +175,17 @@ class ControllerKind:
             options: how it is hosted.
 
         Raises:
-            UserError: by subclasses, where it cannot be loaded.
+            UserError: if it cannot be loaded.
         """
         self.spec, self.options = spec, options
+        self.load()
+
+    def load(self) -> None:
+        """Read the spec and load what it names, in the constructor; subclasses implement it.
+
+        Raises:
+            UserError: if it cannot be loaded.
+        """
 
     @classmethod
     def waits(cls, _argument: str) -> bool:
@@ -308,17 +316,13 @@ class FileKind(ControllerKind):
     names: ClassVar[tuple[str, ...]]
     hosted, asks_sumo = True, False
 
-    def __init__(self, spec: ControllerSpec, options: ControllerOptions) -> None:
+    def load(self) -> None:
         """Import the library and check the file.
-
-        Args:
-            spec: the controller.
-            options: how it is hosted.
 
         Raises:
             UserError: if the library or the file cannot be used.
         """
-        super().__init__(spec, options)
+        spec = self.spec
         self.path, self.chosen = Path(spec.argument), dict(spec.parameters)
         for name in self.chosen:
             if name not in self.names:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from merge_sumo.controllers.spec import ControllerKind, ControllerOptions, ControllerSpec
+from merge_sumo.controllers.spec import ControllerKind
 from merge_sumo.drivers.acceleration_lane import speed_to_stop_mps
 from merge_sumo.drivers.base import MERGE, STAY, Driver, Scene
 from merge_sumo.errors import UserError
@@ -61,17 +61,13 @@ class SumoKind(ControllerKind):
     example = '--vut "sumo:IDM?tau=1.2"'
     own_code = False
 
-    def __init__(self, spec: ControllerSpec, options: ControllerOptions) -> None:
+    def load(self) -> None:
         """Take model and options.
-
-        Args:
-            spec: the model and its options.
-            options: how it is hosted.
 
         Raises:
             UserError: for a model, an option or a value that SUMO does not have.
         """
-        super().__init__(spec, options)
+        spec = self.spec
         model = spec.argument
         if model not in MODELS:
             raise UserError(f"{spec}: choose one of sumo:{', sumo:'.join(MODELS)}")

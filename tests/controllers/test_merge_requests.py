@@ -78,7 +78,7 @@ def test_a_controller_answers_an_acceleration_or_it_and_a_merge_request(write_vu
 
 
 @pytest.mark.parametrize("process", ["this", "own"])
-def test_a_batched_controller_answers_one_row_or_two(write_vut, process):
+def test_a_batched_controller_answers_merge_requests_in_a_second_row(write_vut, process):
     idle = on_lane([-90.0, -71.0, -50.0], [False, False, True])
     idle = idle._replace(active=np.array([True, True, False]))
     driver = begun(write_vut(OF_ALL), 3, in_process=process == "this")
@@ -87,10 +87,6 @@ def test_a_batched_controller_answers_one_row_or_two(write_vut, process):
         assert driver.merge_requests().tolist() == [STAY, MERGE, NO_REQUEST]
     finally:
         driver.close()
-    one_row = write_vut(OF_ALL.replace(", seen.may_merge", ""), file="one_row.py")
-    driver = begun(one_row, 3, in_process=True)
-    assert driver.act(idle).tolist() == [1.0, 1.0, 0.5]
-    assert driver.merge_requests() is None
 
 
 REQUESTS = {"True": MERGE, "0.0": STAY, "np.array(1)": MERGE}

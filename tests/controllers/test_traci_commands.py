@@ -5,10 +5,8 @@
 from __future__ import annotations
 
 import math
-import re
 import struct
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -224,15 +222,3 @@ traci.close()
         x, y = drive.road.ramp.point(-182.0)[2:4]
         with pytest.raises(traci.TraCIException, match="m away"):
             drive.ours.vehicle.moveToXY("vut", "", -1, x, y + 9.0)
-
-
-def test_the_controller_of_the_tutorial_merges_into_a_gap_on_an_acceleration_lane(tmp_path):
-    page = Path(__file__).parents[2] / "docs/tutorials/traci-controller.md"
-    _, source = re.findall(
-        r"```python\n(import sys, traci.*?)```", page.read_text("utf-8"), re.DOTALL
-    )
-    vut = factory("traci:" + program(tmp_path, source), deadline_s=20.0)
-    *_, after_the_pov = run_on(vut, named_scenario("us23-lane"), 0, 4, corridors=1)
-    assert after_the_pov.error is None
-    assert -60.0 < after_the_pov.x_vut_m[-1] < 20.0
-    assert after_the_pov.x_pov_m[-2] - after_the_pov.x_vut_m[-2] > 25.0

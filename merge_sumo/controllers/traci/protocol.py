@@ -68,6 +68,11 @@ class Reader:
     """Reads values from bytes, one after the other; its methods raise `ProtocolError`."""
 
     def __init__(self, data: bytes) -> None:
+        """Begin at the first byte.
+
+        Args:
+            data: the bytes.
+        """
         self._data, self._at = data, 0
 
     @property
@@ -92,13 +97,9 @@ class Reader:
         Args:
             form: a form of `struct` for a number, or "s" for a string.
         """
-        if form == "s":
-            return self.string()
-        (number,) = struct.unpack(f"!{form}", self.raw(struct.calcsize(f"!{form}")))
-        return number
-
-    def string(self) -> str:
-        """Return the next string."""
+        if form != "s":
+            (number,) = struct.unpack(f"!{form}", self.raw(struct.calcsize(f"!{form}")))
+            return number
         try:
             return self.raw(self.value("i")).decode("utf-8")
         except UnicodeDecodeError as error:
@@ -292,7 +293,7 @@ def packed(function: str, answer: Any) -> bytes:
             return compound(len(answer), content)
         return pack("p" if name in POLYGONS else _form_of(answer), answer)
     except (TypeError, ValueError, AttributeError, struct.error) as error:
-        raise ProtocolError("there is no form for the answer") from error
+        raise ProtocolError("its answer has no form here") from error
 
 
 def _form_of(answer: Any) -> str:

@@ -18,7 +18,7 @@ from typing import Any
 
 import msgspec
 
-from merge_sumo.controllers.process import ENDING_S, ChildProcess, connected
+from merge_sumo.controllers.process import ENDING_S, ChildProcess, parent_connection
 from merge_sumo.controllers.traci.protocol import (
     CLOSE,
     STEP,
@@ -119,7 +119,7 @@ class ServerProcess(ChildProcess):
             values: other arguments of the method.
 
         Raises:
-            ProcessDiedError: if there is no reply in time, or the process is gone.
+            ProcessDiedError: if no reply comes in time, or the process has ended.
             UserError: if the process cannot do it.
         """
         self.send(msgspec.msgpack.encode((action, values)))
@@ -142,7 +142,7 @@ def main(settings: Mapping[str, Any]) -> None:
         settings: those of `ServerProcess`.
     """
     limits = {"RLIMIT_DATA": MOST_MEMORY_BYTES, "RLIMIT_FSIZE": MOST_FILE_BYTES}
-    connection, server = connected(settings, **limits), Server(Path(settings["folder"]))
+    connection, server = parent_connection(settings, **limits), Server(Path(settings["folder"]))
     os.chdir(settings["folder"])
     with suppress(EOFError, OSError):
         while True:
@@ -162,6 +162,11 @@ class Server:
     _client: socket.socket
 
     def __init__(self, folder: Path) -> None:
+        """Take the files; SUMO starts with the first client.
+
+        Args:
+            folder: the folder of `write_files`.
+        """
         self._folder = folder
         self._sumo: MirrorSimulation | None = None
 
@@ -195,7 +200,7 @@ class Server:
         self._deadline_s = deadline_s
         self._commands: deque[Command] = deque()
         self._answers = b""
-        self._until_step_s: float | None = None
+        self._target_s: float | None = None
         """Time in s to which the client steps, 0 for one step; None where it does not step yet."""
         return Reply()
 
@@ -234,25 +239,25 @@ class Server:
                 session.clear()
             else:
                 session.step()
-            if self._until_step_s is not None:
-                self._until_step_s = 0.0  # the time that it asked for will not come
+            if self._target_s is not None:
+                self._target_s = 0.0  # the time that it asked for will not come
             self._answer_step()
             self._serve_until_step(ENDING_S)
         return Reply()
 
     def _answer_step(self) -> None:
         """Answer the step that the client waits for, unless it asked to step on further."""
-        until_s = self._until_step_s
+        until_s = self._target_s
         if until_s is None or until_s > self._session.sumo.time_s + ROUNDING_S:
             return
-        self._until_step_s = None
+        self._target_s = None
         self._answers += status(STEP) + self._session.results()
         self._flush()
 
     def _serve_until_step(self, patience_s: float = math.inf) -> None:
         """Answer commands until the client waits for a step."""
         until = monotonic() + min(self._deadline_s, patience_s)
-        while self._until_step_s is None:
+        while self._target_s is None:
             if not self._commands:
                 self._commands.extend(self._receive(until))
             command = self._commands.popleft()
@@ -267,7 +272,7 @@ class Server:
             except NotFiniteError as error:
                 raise FaultError(f"the controller commanded {error}") from error
             until += monotonic() - before_s  # the client waits for SUMO
-            if self._until_step_s is None:
+            if self._target_s is None:
                 self._flush()
 
     def _do(self, command: Command) -> None:
@@ -288,7 +293,7 @@ class Server:
         target_s = Reader(command.payload).value("d")
         session.answered()
         if target_s == 0.0 or target_s > sumo.time_s + ROUNDING_S:
-            self._until_step_s = target_s
+            self._target_s = target_s
         else:
             self._answers += status(STEP) + session.results()
 

@@ -185,11 +185,11 @@ class Session:
         self.subscriptions: dict[Subject, dict[int, bytes]] = {}
         self.in_vain: set[str] = set()
         self.expected = True
-        self._reached_mps: float | None = None
+        self._next_mps: float | None = None
         """Speed at the end of the next step, as commanded."""
-        self._moved: _Place | None = None
+        self._last_place: _Place | None = None
         """Place to which the client moved the VUT in the last step."""
-        self._moves: _Place | None = None
+        self._next_place: _Place | None = None
         """Place to which it moves the VUT in the next step."""
         self._commands_speeds = False
         """Whether the client has commanded a speed in this episode."""
@@ -207,7 +207,7 @@ class Session:
             states: their states.
             seed: seed of the episode, a parameter of the VUT.
         """
-        self._moved = self._moves = self._reached_mps = None
+        self._last_place = self._next_place = self._next_mps = None
         self._commands_speeds = False
         self.in_vain.clear()
         self.sumo.enter(states)
@@ -220,7 +220,7 @@ class Session:
             The speed in m/s that the client says the VUT has reached, or else that SUMO gives it;
             None where the VUT is not on the road.
         """
-        v_mps, moves, reached_mps = self.sumo.step(), self._moves, self._reached_mps
+        v_mps, moves, reached_mps = self.sumo.step(), self._next_place, self._next_mps
         if moves is not None and reached_mps is None:
             reached_mps = moves.v_mps
         if v_mps is not None and reached_mps is not None:
@@ -236,7 +236,7 @@ class Session:
             merged: whether the VUT has left the acceleration lane.
         """
         self.sumo.put(states, merged=merged)
-        is_moved = self._moves is not None or self._reached_mps is not None
+        is_moved = self._next_place is not None or self._next_mps is not None
         if is_moved and not self._commands_speeds and VUT_ID in self.sumo.at_m:
             # As from its departure on, it keeps its speed where nothing is commanded.
             self.sumo.call("vehicle.setSpeed", VUT_ID, states[VUT_ID][1])
@@ -250,7 +250,7 @@ class Session:
 
     def results(self) -> bytes:
         """Return the answer to a step without its status: the subscribed values."""
-        self._moved, self._moves, self._reached_mps = self._moves, None, None
+        self._last_place, self._next_place, self._next_mps = self._next_place, None, None
         answers = []
         for subject, variables in self.subscriptions.items():
             with suppress(RefusedError):  # SUMO has it no more
@@ -276,7 +276,7 @@ class Session:
     def _answer(self, identifier: int, reader: Reader) -> bytes:
         """Return the answer without its status."""
         if identifier in QUESTIONS:
-            variable, name = reader.value("B"), reader.string()
+            variable, name = reader.value("B"), reader.value("s")
             value = self._value(identifier, variable, name, reader)
             return command(bytes((identifier + RESPONSE, variable)) + string(name) + value)
         if identifier - SET in QUESTIONS:
@@ -292,7 +292,7 @@ class Session:
         if getter not in QUESTIONS:
             raise RefusedError(f"merge-sumo does not carry out {name_of(identifier)}")
         reader.raw(16)  # its begin and its end: it holds until it is ended
-        name, range_m = reader.string(), None
+        name, range_m = reader.value("s"), None
         if is_context:
             domain, range_m = reader.value("B"), reader.value("d")
         return self._subscribe(Subject(getter, name, domain, range_m), reader)
@@ -353,7 +353,7 @@ class Session:
         elif letter.islower():
             function, arguments = "convertGeo", [*place[:2], PLACES[kind] in "gG"]
         else:
-            raise ProtocolError(f"there are no coordinates {target}")
+            raise ProtocolError(f"coordinates of type {target} do not exist")
         return pack(letter, self.sumo.call(f"simulation.{function}", *arguments))
 
     def _driving_distance(self, name: str, reader: Reader) -> tuple[str, list[Any]]:
@@ -363,7 +363,7 @@ class Session:
         if kind == ROAD:
             return "vehicle.getDrivingDistance", [name, *place]
         x, y, *_ = place
-        # Where there is no road, SUMO would end.
+        # At a point without a road SUMO would end.
         self.sumo.call("simulation.convertRoad", x, y, kind == LON_LAT, "passenger")
         return "vehicle.getDrivingDistance2D", [name, x, y]
 
@@ -375,8 +375,8 @@ class Session:
         Args:
             name: the vehicle.
         """
-        if name == VUT_ID and self._moved is not None:
-            return self._moved.point
+        if name == VUT_ID and self._last_place is not None:
+            return self._last_place.point
         return self.sumo.point(name)[2:4]
 
     # Subscriptions
@@ -446,7 +446,7 @@ class Session:
 
     def _command(self, setter: int, reader: Reader) -> None:
         """Have a command carried out, or note that it changes nothing, or refuse it."""
-        variable, target = reader.value("B"), reader.string()
+        variable, target = reader.value("B"), reader.value("s")
         names = functions().get((setter, variable), ())
         name, effect = name_of(setter, variable), effect_of(names)
         if effect is Effect.REFUSED:
@@ -507,18 +507,21 @@ class Session:
         if function == "vehicle.setPreviousSpeed":
             if numbers[0] < 0.0:
                 raise RefusedError("Previous speed must not be negative.")
-            self._reached_mps = numbers[0]
+            self._next_mps = numbers[0]
             return
         paths = [self.sumo.path(VUT_ID), self.sumo.road.mainline][: 1 + self.sumo.has_lane]
         x, y = numbers[:2]
-        away_m, x_m, number = min((*path.nearest(x, y), i) for i, path in enumerate(paths))
+        found = []
+        for number, path in enumerate(paths):
+            found.append((*path.nearest(x, y), number))
+        away_m, x_m, number = min(found)
         if not away_m <= OFF_THE_LANE_M:
             raise RefusedError(
                 f"{function} takes points up to {OFF_THE_LANE_M} m from the lane of the VUT: "
                 f"this one is {away_m:.4g} m away"
             )
-        before_m = self._moved.x_m if self._moved else self.sumo.at_m[VUT_ID]
-        self._moves = _Place((x_m - before_m) / DT_S, x_m, (x, y), number > 0)
+        before_m = self._last_place.x_m if self._last_place else self.sumo.at_m[VUT_ID]
+        self._next_place = _Place((x_m - before_m) / DT_S, x_m, (x, y), number > 0)
 
     def _check_vehicle(self, name: str) -> None:
         if name not in self.sumo.at_m:

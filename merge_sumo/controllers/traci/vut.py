@@ -24,7 +24,7 @@ from merge_sumo.controllers.process import (
     code_of,
     split_command,
 )
-from merge_sumo.controllers.spec import ControllerKind, ControllerOptions, ControllerSpec
+from merge_sumo.controllers.spec import ControllerKind
 from merge_sumo.controllers.traci.server import FaultError, Reply, ServerProcess
 from merge_sumo.drivers.acceleration_lane import speed_to_stop_mps
 from merge_sumo.drivers.base import MERGE, STAY, ControllerDiedError, Driver, Scene
@@ -51,7 +51,7 @@ WORK_S = 10.0
 class TraciKind(ControllerKind):
     """A TraCI client: `traci`, `traci:PORT` or `traci:COMMAND`.
 
-    A command is told its port, so several can run at a time.
+    A command gets a port of its own, so several can run at a time.
 
     Attributes:
         command: starts the client; None where the user does.
@@ -72,32 +72,28 @@ class TraciKind(ControllerKind):
         "FMU, a network or sumo:MODEL"
     )
 
-    def __init__(self, spec: ControllerSpec, options: ControllerOptions) -> None:
+    def load(self) -> None:
         """Read the port or the command.
-
-        Args:
-            spec: the port or the command.
-            options: how it is hosted.
 
         Raises:
             UserError: for an invalid port or command, and for code that others may write.
         """
-        super().__init__(spec, options)
+        argument = self.spec.argument
         self.command, self.port = None, 0
-        if self.waits(spec.argument):
-            self.port = int(spec.argument or DEFAULT_PORT)
+        if self.waits(argument):
+            self.port = int(argument or DEFAULT_PORT)
             if not 1 <= self.port <= 65535:
-                raise UserError(f"{spec}: the port is a number from 1 to 65535")
+                raise UserError(f"{self.spec}: the port is a number from 1 to 65535")
             self.max_workers = 1
         else:
-            self.command = split_command(spec.argument)
+            self.command = split_command(argument)
             self.code = code_of(self.command)
         for file in self.code:
             check_code(file)
 
     @classmethod
     def waits(cls, argument: str) -> bool:
-        """Return whether the user starts the client: there is no command, at most a port.
+        """Return whether the user starts the client: without a command, at most with a port.
 
         Args:
             argument: argument of a spec.
