@@ -1,4 +1,7 @@
-"""The command line: each command parses a config, calls the verb of the API, and prints."""
+"""The command line: each command parses a config, passes its fields to a verb, and prints.
+
+The verbs are the functions of `api.py`; `api.verb` makes the config of a verb from the fields.
+"""
 
 from __future__ import annotations
 
@@ -434,8 +437,8 @@ def main() -> None:
     """Run the command line; a `UserError` becomes one sentence and exit code 2.
 
     So does an error of the system that has run out of something. What a signal stopped ends with
-    128 + its number. Any other error is a fault of this package, and ends with a code that is no
-    result: 1, which Python would give, is that of a gate that is met.
+    128 + its number. Any other error is a fault of this package, with an exit code of its own: 1,
+    which Python would give, means that a gate is met.
     """
     prepare_streams()
     for library in ("OMP", "OPENBLAS", "MKL"):  # products are small, and the cores are for workers

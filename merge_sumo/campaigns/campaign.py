@@ -56,9 +56,9 @@ def run_campaign(
     ended with a whole batch. The worst failures are exported as folders that sumo-gui opens.
 
     Args:
-        settings: what to run; of a campaign that resumes, those of the folder, and those that were
+        settings: what to run; to resume, the settings of the folder with the controllers that were
             named again (`settings_from_folder`).
-        plan: how its cases run: that of the settings (`load_plan`).
+        plan: how its cases run (`settings.load_plan()`).
         folder: where to.
         callbacks: called in turn with the outcomes of one or more batches when they are stored.
         resumes: whether the folder has a campaign that was stopped, however it was.

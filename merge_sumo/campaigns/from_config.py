@@ -91,7 +91,7 @@ def settings_from_config(
 
 
 def _new_settings(named: dict[str, Any]) -> CampaignSettings:
-    """Return settings whose failures are those of the scenario, where nothing else is named."""
+    """Return settings, by default with the criterion of the scenario."""
     if "require" not in named:
         named.setdefault("fail_when", named["scenario"].criterion)
     return CampaignSettings(**named)

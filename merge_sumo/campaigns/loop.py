@@ -214,8 +214,8 @@ def tell(sampler: Sampler, episodes: Sequence[Episode]) -> None:
 
     Args:
         sampler: the sampler.
-        episodes: episodes in the order of their cases. Where each has that of the earlier version,
-            the sampler is told regressions.
+        episodes: episodes in the order of their cases. With episodes of an earlier version, the
+            sampler is told regressions.
     """
     earlier = [episode.earlier for episode in episodes if episode.earlier is not None]
     outcomes = [episode.outcome for episode in episodes]

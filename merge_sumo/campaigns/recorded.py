@@ -98,8 +98,10 @@ class RecordedCampaign:
         outcomes: the outcomes, in order.
         torn: whether the last line of them was torn, and its case left out.
 
-    Raises `UserError` when the folder is not a campaign, a line of it cannot be read, or something
-    is not as it was written.
+    Example:
+        run = RecordedCampaign(Path("runs/design2"))
+        worst = failures(run.cases)[0]
+        motion = run.trajectory(worst.index).motion
     """
 
     def __init__(self, folder: Path) -> None:
@@ -107,6 +109,10 @@ class RecordedCampaign:
 
         Args:
             folder: the folder.
+
+        Raises:
+            UserError: the folder is not a campaign, a line of it cannot be read, or something is
+                not as it was written.
         """
         self._take(folder, read_settings(folder), folder / SETTINGS)
         self.criterion = Criterion(self.settings.fail_when, self.settings.require)
@@ -124,7 +130,7 @@ class RecordedCampaign:
         try:
             self.settings = convert(known, RecordedSettings)
         except UserError as error:
-            raise UserError(f"{place} is not that of a campaign: {error}") from error
+            raise UserError(f"{place} does not describe a campaign: {error}") from error
 
     def _read(self) -> None:
         path = self.folder / OUTCOMES
@@ -295,7 +301,7 @@ class RecordedCampaign:
         return earlier
 
     def whole_batches(self) -> int:
-        """Return the number of outcomes without those of a last batch that is not complete.
+        """Return the number of outcomes in complete batches; only the last may not be complete.
 
         The trajectories are written first: a batch is complete when it has an outcome for each.
         """
@@ -346,7 +352,7 @@ def read_settings(folder: Path) -> dict[str, Any]:
     except OSError as error:
         raise _no_campaign(folder, error) from error
     except UserError as error:
-        raise UserError(f"{path} is not that of a campaign: {error}") from error
+        raise UserError(f"{path} does not describe a campaign: {error}") from error
     return settings
 
 
@@ -501,7 +507,7 @@ def _motion_by_case(vehicles: int, arrays: Mapping[str, NDArray[Any]]) -> dict[i
         raise ValueError("the motion has numbers that are too large or not finite")
     within = rows.dtype.kind == "i" and ((rows >= 1) & (rows <= len(motion))).all()
     if not within or rows.ndim != 1 or rows.sum() != len(motion):
-        raise ValueError("the rows of the cases are not those of the motion")
+        raise ValueError("the rows of the cases do not fit the motion")
     parts = np.split(motion.reshape(-1, vehicles, 3), np.cumsum(rows)[:-1])
     return dict(zip(index.tolist(), parts, strict=True))
 

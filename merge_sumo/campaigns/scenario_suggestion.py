@@ -212,9 +212,10 @@ def lane_warnings(scenario: Scenario, road: Road) -> list[str]:
 
 
 ALIKE: Final = 0.25
-"""What a number may differ from those of training, as a share of them, and a range be exceeded by,
-as a share of its width. In random scenarios as near as this the shipped POV-1 and VUT-1 had a mean
-regret of up to 4 % and collided nowhere avoidably; farther away, of up to 136 %."""
+"""Maximum difference of a number from training, as a share of the number, and maximum excess over
+a range of training, as a share of its width. In random scenarios within these bounds, the shipped
+POV-1 and VUT-1 had a mean regret of up to 4 % and had no avoidable collision; outside, the regret
+was up to 136 %."""
 
 
 def unseen(scenario: Scenario, policies: Path | None = None) -> list[str]:
@@ -236,27 +237,30 @@ def unseen(scenario: Scenario, policies: Path | None = None) -> list[str]:
 
 
 def _differences(scenario: Scenario, trained: Scenario) -> list[str]:
-    """Return the numbers of a scenario that are not like those of training, in sentences."""
+    """Return the numbers of a scenario that differ from training, in sentences."""
     unit, known = Units.of(scenario), Units.of(trained)
     length, speed = known.length / unit.length, known.speed / unit.speed
     time = known.time / unit.time
-    slower_mps = trained.v_hw_min_mps - speed * scenario.v_hw_min_mps
-    alike = {
-        "x_pov0_m": (length, 0.0),
-        "v_pov0_mps": (speed, slower_mps),
-        "v_vut0_mps": (speed, slower_mps),
-        "v_hw_min_mps": (speed, 0.0),
-        "v_hw_max_mps": (speed, 0.0),
-        "v_min_mps": (speed, 0.0),
-        "a_min_mps2": (speed / time, 0.0),
-        "a_max_mps2": (speed / time, 0.0),
-        "level0_a_mps2": (speed / time, 0.0),
-        "ttc_min_s": (time, 0.0),
-        "dx_crash_m": (length, 0.0),
-        "dx_critical_m": (known.gap / unit.gap, 0.0),
+    acceleration = speed / time
+    factors = {
+        "x_pov0_m": length,
+        "v_pov0_mps": speed,
+        "v_vut0_mps": speed,
+        "v_hw_min_mps": speed,
+        "v_hw_max_mps": speed,
+        "v_min_mps": speed,
+        "a_min_mps2": acceleration,
+        "a_max_mps2": acceleration,
+        "level0_a_mps2": acceleration,
+        "ttc_min_s": time,
+        "dx_crash_m": length,
+        "dx_critical_m": known.gap / unit.gap,
     }
+    # Initial speeds are relative to the slowest speed of the mainline.
+    slower_mps = trained.v_hw_min_mps - speed * scenario.v_hw_min_mps
     sentences = []
-    for name, (factor, offset) in alike.items():
+    for name, factor in factors.items():
+        offset = slower_mps if name in ("v_pov0_mps", "v_vut0_mps") else 0.0
         low, high = (factor * bound + offset for bound in scenario.bounds(name))
         known_low, known_high = trained.bounds(name)
         pool = trained.bounds("v_pov0_mps" if name == "v_vut0_mps" else name)

@@ -121,7 +121,7 @@ class CampaignSettings(Search):
             known = ", ".join(map(level_name, ALL_LEVELS))
             raise UserError(f"the levels are {list(self.levels)}: choose from {known}")
         if OWN in self.levels and self.pov is None:
-            raise UserError("level own is that of a POV of your own: name one as `pov`")
+            raise UserError("level own needs a POV of your own: name one as `pov`")
 
     def _check_in_flight(self) -> None:
         if self.batch is not None:
@@ -251,7 +251,8 @@ def same_pov(a: Mapping[str, Any], b: Mapping[str, Any], level: int) -> bool:
 
     Args:
         a: content of `campaign.json` of a campaign.
-        b: that of another campaign; files that only one of both recorded decide nothing.
+        b: content of `campaign.json` of the other; a file that only one of them recorded decides
+            nothing.
         level: the level.
     """
     if level == OWN and a.get("pov") != b.get("pov"):

@@ -10,15 +10,11 @@ import merge_sumo as ms
 from merge_sumo.campaigns.recorded import RecordedCampaign
 from merge_sumo.campaigns.repeatability import (
     REPEATS,
-    SecondRun,
     cases_to_repeat,
     read_second_runs,
     unrepeatable,
 )
-from merge_sumo.errors import UserError
-from merge_sumo.records import to_json
 from merge_sumo.reports.report import write_report
-from merge_sumo.scenario.trajectory import End
 
 REMEMBERS = """
 import collections
@@ -66,15 +62,3 @@ def test_drivers_of_the_package_and_clients_that_a_user_starts_run_once(run):
     assert cases_to_repeat(run.outcomes, settings) == []
     started = campaign_settings(vut="traci:python3 client.py {port}")
     assert len(cases_to_repeat(run.outcomes, started)) == 8
-
-
-def test_a_changed_file_is_refused_by_its_line(run, tmp_path):
-    for name in ("campaign.json", "outcomes.jsonl"):
-        (tmp_path / name).write_bytes((run.folder / name).read_bytes())
-    opened, repeat = RecordedCampaign(tmp_path), SecondRun(3, 1.5, "vut", End.MERGED, False, True)
-    line = to_json(repeat)
-    (tmp_path / REPEATS).write_bytes(line)
-    assert read_second_runs(opened) == [repeat]
-    (tmp_path / REPEATS).write_bytes(line + line.replace(b"vut", b"<script>"))
-    with pytest.raises(UserError, match=r"line 2 of .*repeats.jsonl is not as it was written"):
-        read_second_runs(opened)
