@@ -151,6 +151,9 @@ class ComparedCase:
             earlier: outcomes of the case with the earlier version, one for each run.
             later: outcomes with the later version.
             tolerated: share of its runs in which a case may fail, 0 to 1.
+
+        Returns:
+            The case, with the deciding run of each version.
         """
         runs, other = _repeated(earlier), _repeated(later)
         p_value = None
@@ -334,6 +337,9 @@ def compare(runs: Sequence[RecordedCampaign]) -> Comparison:
 
     Args:
         runs: two campaigns or more, the oldest first.
+
+    Returns:
+        The comparison, with the changes from each campaign to the next.
 
     Raises:
         UserError: for fewer than two campaigns, and where they differ in the scenario, the

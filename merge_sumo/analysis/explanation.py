@@ -195,6 +195,9 @@ def explain(
         index: index of the failure; None for the worst.
         ranges: parameters of the VUT, with the range to search.
 
+    Returns:
+        The explanation, with its campaign.
+
     Raises:
         UserError: for an index without a failure, for a campaign with another net or other POVs,
             for a parameter that the VUT does not have, and where a case that runs a second time

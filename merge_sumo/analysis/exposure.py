@@ -110,7 +110,12 @@ class Uniform(_Shape, frozen=True, tag_field="kind", tag="uniform"):
     """A uniform distribution."""
 
     def law(self, low: float, high: float) -> Any:
-        """Return the distribution of scipy."""
+        """Return the distribution of scipy, before it is cut off.
+
+        Args:
+            low: lower bound, in the unit of the coordinate.
+            high: upper bound.
+        """
         from scipy.stats import uniform
 
         return uniform(low, high - low)
@@ -128,7 +133,12 @@ class Normal(_Shape, frozen=True, kw_only=True, tag_field="kind", tag="normal"):
     sd: Annotated[float, Meta(ge=1e-3, le=1e3)]
 
     def law(self, low: float, high: float) -> Any:
-        """Return the distribution of scipy."""
+        """Return the distribution of scipy, before it is cut off.
+
+        Args:
+            low: lower bound, in the unit of the coordinate.
+            high: upper bound.
+        """
         from scipy.stats import norm
 
         return norm(self.mean, self.sd)
@@ -146,7 +156,12 @@ class Histogram(_Shape, frozen=True, kw_only=True, tag_field="kind", tag="histog
     weights: Weights
 
     def law(self, low: float, high: float) -> Any:
-        """Return the distribution of scipy."""
+        """Return the distribution of scipy, before it is cut off.
+
+        Args:
+            low: lower bound, in the unit of the coordinate.
+            high: upper bound.
+        """
         from scipy.stats import rv_histogram
 
         edges, weights = np.array(self.edges), self.weights
@@ -325,7 +340,7 @@ def named_traffic(name: str) -> Traffic:
         name: name of the traffic, or path of the file.
 
     Raises:
-        UserError: where no such traffic exists, or the file is no traffic.
+        UserError: where no such traffic exists, or the file is not one.
     """
     shipped = {path.stem: path for path in sorted(FOLDER.glob(f"*{SUFFIX}"))}
     path = shipped.get(name, Path(name))

@@ -44,6 +44,9 @@ def write_scenario(options: config.NewScenario) -> Shown:
     Args:
         options: options of the verb.
 
+    Returns:
+        Sentences on the road, and the paths that were written.
+
     Raises:
         UserError: for a net without such a merge, and for files that exist.
     """

@@ -217,6 +217,9 @@ def failure_probability(
         options: options of the verb.
         out: new file for the result.
 
+    Returns:
+        The result, as it is in the file.
+
     Raises:
         UserError: for a distribution, a traffic or numbers that make no sense, for a campaign with
             another net or other POVs, and for a file that exists or cannot be written.

@@ -240,6 +240,9 @@ def reproduce(
         workers: where cases run; None for this process.
         on_part: called with the progress of each part.
 
+    Returns:
+        The results, without a page.
+
     Raises:
         UserError: where a level has no POV.
     """

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from merge_sumo.analysis.cases_file import CasesFile
@@ -10,6 +10,7 @@ from merge_sumo.analysis.comparison import (
     LISTED,
     PAGE,
     Change,
+    ComparedCase,
     Comparison,
     Version,
     in_order,
@@ -19,12 +20,18 @@ from merge_sumo.analysis.comparison import (
 from merge_sumo.analysis.run_study import RunStudy
 from merge_sumo.campaigns.printed_commands import command
 from merge_sumo.campaigns.recorded import RecordedCampaign
-from merge_sumo.campaigns.repeatability import may_not_repeat, second_run_of, unrepeatable
+from merge_sumo.campaigns.repeatability import (
+    SecondRun,
+    may_not_repeat,
+    second_run_of,
+    unrepeatable,
+)
 from merge_sumo.errors import UserError
 from merge_sumo.files import free
 from merge_sumo.metrics.outcome import Episode, Outcome
 from merge_sumo.printable import counted
 from merge_sumo.scenario.scenario import AnyLevels, level_name, names_of_levels
+from merge_sumo.scenario.trajectory import Trajectory
 from merge_sumo.simulation.evaluate import open_simulators, with_measures
 
 AGAIN = (Change.BROKE, Change.WORSE, Change.STILL_CONTACT, Change.FIXED)
@@ -71,6 +78,9 @@ def rerun(study: RunStudy, recorded: Sequence[Outcome]) -> Comparison:
         study: the campaign, and how its cases run now.
         recorded: outcomes of the campaign, whose cases run.
 
+    Returns:
+        The comparison; its earlier version is the record.
+
     Raises:
         UserError: where the net or the POV are not those of the campaign.
     """
@@ -91,27 +101,13 @@ def rerun(study: RunStudy, recorded: Sequence[Outcome]) -> Comparison:
     )
     compared = of_two(earlier, later, source)
     (version_change,) = compared.version_changes
-    cases, changed = [], []
-    for one in version_change.cases:
-        if isinstance(run, CasesFile):
-            one = replace(one, change=run.change_of(one))  # noqa: PLW2901
-        cases.append(one)
-        if one.change in AGAIN and one.later_runs is None:
-            changed.append(one.later)
-    uncounted = RunStudy(run, settings, study.plan, study.workers)
-    second_episodes = _episodes(uncounted, may_not_repeat(changed, settings))
-    repeats = []
-    for row, one in enumerate(cases):
-        second = second_episodes.get(one.later.index)
-        if second is None:
-            continue
-        repeats.append(second_run_of(one.later, motions[one.later.index], second))
-        # Where the VUT reaches its goal neither time, the change is not chance.
-        if not repeats[-1].same and (one.later.is_tested or second.outcome.is_tested):
-            cases[row] = replace(one, change=Change.NOT_REPEATABLE)
+    cases = version_change.cases
+    if isinstance(run, CasesFile):
+        cases = [replace(one, change=run.change_of(one)) for one in cases]
+    cases, second_runs = _repeated(study, cases, motions)
     version_change = replace(version_change, cases=in_order(cases))
     notes = []
-    if warning := unrepeatable(repeats):
+    if warning := unrepeatable(second_runs):
         notes.append(warning)
     if number := version_change.count(Change.NOT_REPEATABLE):
         version_change = with_shares(version_change, recorded, outcomes)
@@ -125,6 +121,26 @@ def rerun(study: RunStudy, recorded: Sequence[Outcome]) -> Comparison:
     page = command("rerun", run.folder, differing[:LISTED], **drivers, out=free(PAGE))
     changes = (version_change,)
     return replace(compared, version_changes=changes, notes=tuple(notes), page_command=page)
+
+
+def _repeated(
+    study: RunStudy, cases: Sequence[ComparedCase], motions: Mapping[int, Trajectory]
+) -> tuple[list[ComparedCase], list[SecondRun]]:
+    """Run changed cases once more; return all cases, and how the second runs compare."""
+    changed = [one.later for one in cases if one.change in AGAIN and one.later_runs is None]
+    uncounted = RunStudy(study.run, study.settings, study.plan, study.workers)
+    episodes = _episodes(uncounted, may_not_repeat(changed, study.settings))
+    judged, second_runs = [], []
+    for one in cases:
+        change, later = one.change, one.later
+        second = episodes.get(later.index)
+        if second is not None:
+            second_runs.append(second_run_of(later, motions[later.index], second))
+            # Where the VUT reaches its goal neither time, the change is not chance.
+            if not second_runs[-1].same and (later.is_tested or second.outcome.is_tested):
+                change = Change.NOT_REPEATABLE
+        judged.append(replace(one, change=change))
+    return judged, second_runs
 
 
 def _episodes(study: RunStudy, outcomes: Sequence[Outcome]) -> dict[int, Episode]:

@@ -56,10 +56,13 @@ class StudyFile(Generic[R]):
         check_generated(folder / self.name, self._mark)
 
     def read(self, folder: Path) -> R | None:
-        """Read the record; None without the file.
+        """Read the record.
 
         Args:
             folder: folder of the campaign.
+
+        Returns:
+            The record; None without the file.
 
         Raises:
             UserError: where the file is not as it was written.
@@ -76,10 +79,13 @@ class StudyFile(Generic[R]):
         replace_own(folder / self.name, to_json(record, indent=1), self._mark)
 
     def read_lines(self, run: RecordedCampaign) -> list[R]:
-        """Read the lines; none without the file.
+        """Read the lines.
 
         Args:
             run: the campaign.
+
+        Returns:
+            The lines in their order; an empty list without the file.
 
         Raises:
             UserError: for a line that is not of a failure of the campaign.

@@ -227,6 +227,9 @@ class Study:
             levels: levels of the POV.
             samplers: names of the samplers.
             options: options of the verb.
+
+        Returns:
+            The searches, and the truth of each level.
         """
         truths, dense = {}, {}
         for level in levels:

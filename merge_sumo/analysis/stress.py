@@ -237,6 +237,9 @@ def stress(study: RunStudy) -> StressResult:
     Args:
         study: the campaign, and how its cases run.
 
+    Returns:
+        The results, as they are in the file.
+
     Raises:
         UserError: for a campaign without a verdict, or with another net or other POVs.
     """

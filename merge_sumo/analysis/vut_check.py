@@ -74,6 +74,9 @@ def check_vut(settings: CampaignSettings) -> VutCheck:
 
     Args:
         settings: settings of a campaign with the VUT at level 0.
+
+    Returns:
+        Its faults, also where it does not start.
     """
     problems: list[str] = []
     notes: list[str] = []

@@ -1,4 +1,4 @@
-"""A cases file: what is in it, what `rerun` says of it, and that nothing else is taken for one."""
+"""Cases files: their content, the output of `rerun`, and files that are refused."""
 
 # mypy: no-strict-optional
 

@@ -1,4 +1,4 @@
-"""Versions of a VUT compared: what broke and what is fixed, by cases, by regions, and by chance."""
+"""Comparisons of versions of a VUT: cases that broke or were fixed, and changes by chance."""
 
 # mypy: no-strict-optional
 

@@ -1,4 +1,4 @@
-"""Why a case fails: what is said is true of the simulation, and the smallest change by hand."""
+"""Explanations hold in the simulation, and the smallest change is that worked out by hand."""
 
 # mypy: no-strict-optional
 
@@ -169,7 +169,7 @@ class TestParameters:
         (of_brake,) = ms.explain(
             run, 0, vut=f"{mine}:Brakes", params=["brake_mps2=1.9..2.06"]
         ).found.parameters
-        # It fails above 2.00125; the end of the range and some that run beside are refused.
+        # It fails above 2.00125; values below 1.99 are refused.
         assert of_brake == Axis("brake_mps2", 2.05, 1.9, 2.06, 0.004, 4, below=2.0012)
 
 

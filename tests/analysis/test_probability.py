@@ -1,4 +1,4 @@
-"""Failure probability: exact intervals by hand, that hold, and what a campaign and a road make."""
+"""Failure probabilities: exact intervals by hand, their coverage, distributions and traffics."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def band(points, middle=0.7, half_width=0.05):
 
 
 def strata(expects, levels=(1,)) -> list[Cells]:
-    """Return the cells of levels of two coordinates, by a mask of what is expected to fail."""
+    """Return the cells of levels of two coordinates, by a mask of expected failures."""
     found = []
     for level, flag in product(levels, (False, True)):
         numbers = np.flatnonzero(expects == flag)
@@ -97,7 +97,7 @@ class TestTheInterval:
         ids=["known", "wrong place"],
     )
     def test_holds_whatever_the_surrogate_expects(self, expects, held, width):
-        """A band of area .125, 600 cases, 200 seeds; the width beside that of plain cases."""
+        """A band of area .125, 600 cases, 200 seeds; the width against that of plain cases."""
         rows = []
         for seed in range(200):
             one = measured(strata(expects), band, 600, seed)

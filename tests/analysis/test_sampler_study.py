@@ -1,4 +1,4 @@
-"""Truths in the cache, and samplers beside each other and a truth, by hand and in SUMO."""
+"""Truths in the cache, and samplers in comparison with each other and with a truth."""
 
 # mypy: no-strict-optional
 

@@ -1,4 +1,4 @@
-"""The ladder of a stress test: what flips is what a case of the rung does by itself."""
+"""Stress tests: a verdict flips on a rung where the case alone flips with that change."""
 
 from __future__ import annotations
 
