@@ -175,7 +175,7 @@ class _Parser:
     def _unknown(self, name: str) -> UserError:
         hint = meant(name, (*self._vocabulary, *self._named))
         hint = hint or f"choose {', '.join(self._vocabulary)}"
-        return self._error(f"there is no measure {printable(name)!r}: {hint.strip()}")
+        return self._error(f"no measure {printable(name)!r}: {hint.strip()}")
 
     def _error(self, why: str) -> UserError:
         return UserError(f"{self._what}: {why}")

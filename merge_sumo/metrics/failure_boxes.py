@@ -10,11 +10,10 @@ import numpy as np
 
 from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.scenario.case import Case, FloatArray, coordinates
-from merge_sumo.scenario.scenario import AHEAD, BEHIND, POV, VUT, Scenario
+from merge_sumo.scenario.scenario import POV, VEHICLES, VUT, Scenario
 
 DECIMALS = {"m": 0, "m/s": 1, "s": 2, "rad": 2}
 """Decimals of the bounds of boxes, by unit."""
-NAMED = {POV: "POV", AHEAD: "car ahead", BEHIND: "car behind"}
 MOST_BOXES = 10
 """Leaves of the decision tree of a level."""
 FEWEST_FAILURES = 3
@@ -56,7 +55,8 @@ def _quantities(cases: Sequence[Case], scenario: Scenario) -> dict[tuple[str, st
             for case in cases:
                 x_m, v_mps = case.starts()[row]
                 due_s.append(-x_m / v_mps if v_mps > 0.0 else scenario.timeout_s)
-            values[f"{NAMED[row]} due at M (at constant speed)", "s"] = due_s
+            name = "POV" if row == POV else f"car {VEHICLES[row]}"
+            values[f"{name} due at M (at constant speed)", "s"] = due_s
     x, v, *others = coordinates(scenario, (cases[0].level,))
     for coordinate in (v, x, *others):
         own = [coordinate.of(case) or 0.0 for case in cases]

@@ -171,7 +171,13 @@ class Measures:
         lines: CentreLines | None = None,
         **values: Any,
     ) -> None:
-        """Take an episode, or the values of measures by name."""
+        """Take an episode, or recorded values.
+
+        Args:
+            trajectory: the motion; None for recorded values.
+            lines: centre lines of the road; None for no clearance before M.
+            values: values of measures by name.
+        """
         self.trajectory: Trajectory = trajectory  # type: ignore[assignment]
         self.lines, self.values = lines, values
 

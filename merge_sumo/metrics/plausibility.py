@@ -102,9 +102,8 @@ def _with_other_thresholds(condition: str) -> Iterator[tuple[str, str]]:
     """Yield a condition with a threshold in another unit or of the other sign, and its meaning."""
     for found in _THRESHOLD.finditer(condition):
         name, number = found[1], float(found[2])
-        others = [(-number, "the other sign")]
+        others = [(-number, "the other sign")] if number else []
         if name.endswith("_mps"):
             others.insert(0, (number / KMH_PER_MPS, f"{number:g} km/h"))
-            others.append((number * KMH_PER_MPS, f"{number:g} m/s as km/h"))
-        for other, why in others if number else []:
+        for other, why in others:
             yield f"{condition[: found.start(2)]}{other:.3g}{condition[found.end(2) :]}", why

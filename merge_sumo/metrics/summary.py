@@ -531,6 +531,6 @@ def _parsed_gate(text: str) -> Gate:
             if 0.0 <= above < 1.0:
                 return Gate("fmc", above)
     raise UserError(
-        f'there is no gate {printable(text)!r}: choose {", ".join(NUMBERS)} or "fmc>X" with X '
+        f'no gate {printable(text)!r}: choose {", ".join(NUMBERS)} or "fmc>X" with X '
         'from 0 to below 1 (in quotes, or the shell takes the ">")'
     )

@@ -86,7 +86,7 @@ def check_formula(text: str) -> str:
     for word in _WORD.findall(text):
         if word not in known:
             hint = meant(word, known) or f"choose {', '.join(SIGNALS)}"
-            raise UserError(f"{what}: there is no signal {word!r}: {hint.strip()}")
+            raise UserError(f"{what}: no signal {word!r}: {hint.strip()}")
     depth = 0
     for sign in text:
         depth += (sign == "(") - (sign == ")")

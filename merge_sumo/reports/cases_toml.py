@@ -1,4 +1,4 @@
-"""Cases files: the choice of cases, and how they are written."""
+"""Cases files: the choice of cases, and their text."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ from merge_sumo.scenario.scenario import Scenario
 from merge_sumo.scenario.trajectory import End
 
 MOST = 40
-"""Cases of a file where the user names none."""
+"""Maximum number of cases of a file where the user names none."""
 ABOUT = """\
 # `merge-sumo rerun THIS-FILE --vut SPEC` exits with 1 where a case passes no more, ends in a new
 # error, or passes with a new contact or a margin, in units of the criterion's thresholds, that is
@@ -46,12 +46,12 @@ ABOUT = """\
 
 
 def with_file(compared: Comparison, file: CasesFile, path: Path) -> Comparison:
-    """Return a comparison of a cases file with its current text, and notes on the changes.
+    """Return the comparison of a cases file with its new text, and notes on the changes.
 
     Args:
         compared: the comparison.
         file: the cases file.
-        path: place of a file with the current text.
+        path: path of a file with the new text, to which its net is relative.
     """
     (version_change,), (_, now) = compared.version_changes, compared.versions
     outcomes = {one.index: one for one in (*file.outcomes, *now.outcomes)}
@@ -77,11 +77,14 @@ def with_file(compared: Comparison, file: CasesFile, path: Path) -> Comparison:
 
 
 def watching(run: RecordedCampaign) -> list[Outcome]:
-    """Return at most 40 outcomes of a campaign: of more, those that detect changes of a controller.
+    """Return at most 40 outcomes of a campaign, those that detect changes of a controller.
 
-    A quarter are the worst failures of regions. The others pass where enough cases do: of each
-    level in turn the one of least margin, then the one of least clearance, both a radius from those
+    A quarter are the worst failures of regions. The others pass, if enough cases do: of each level
+    in turn the one of least margin, then the one of least clearance, both a radius from those
     chosen before, then the farthest one.
+
+    Args:
+        run: the campaign; all of its outcomes if there are not more.
     """
     if len(run.outcomes) <= MOST:
         return run.outcomes
@@ -109,7 +112,12 @@ def watching(run: RecordedCampaign) -> list[Outcome]:
 def new_file_in(target: Path, name: str) -> Path:
     """Return the path of a new file: `target` if it has an ending, else `name` in that folder.
 
-    Raises `UserError` where no such file can be made, or the ending is not that of `name`.
+    Args:
+        target: path of the new file, or a folder for it, which is created.
+        name: name of a file in a folder.
+
+    Raises:
+        UserError: no such file can be created, or `target` has another ending than `name`.
     """
     ending = Path(name).suffix
     if target.suffix == ending or (target.suffix and not target.is_dir()):
@@ -131,7 +139,7 @@ def write_cases(run: RecordedCampaign, indices: Sequence[int], target: Path) -> 
         The path of the file.
 
     Raises:
-        UserError: there is no such case, or the file cannot be written.
+        UserError: a case does not exist, or the file cannot be written.
     """
     outcomes = [run.outcome(index) for index in dict.fromkeys(indices)] or watching(run)
     path = new_file_in(target, f"cases{SUFFIX}")

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from merge_sumo.analysis.comparison import Change, Comparison, VersionChange, compare_against
-from merge_sumo.campaigns.recorded import AGAINST, RecordedCampaign
+from merge_sumo.analysis.comparison import Change, Comparison, VersionChange
+from merge_sumo.campaigns.recorded import AGAINST
 from merge_sumo.files import GENERATOR, replace_own
 from merge_sumo.metrics.cause import cause
 from merge_sumo.reports.pages import X_AXIS, page
@@ -34,19 +35,18 @@ AGAINST_PAGE = f"{AGAINST}{PAGE}"
 STYLES = ("report.css", "comparison.css")
 
 
-def write_against(run: RecordedCampaign) -> None:
-    """Write the page of a campaign against an earlier version into its folder.
+def write_against(folder: Path, compared: Comparison) -> None:
+    """Write the page of a campaign against an earlier version, in place of an older one.
 
     Args:
-        run: the campaign; without an earlier version nothing is written.
+        folder: folder of the campaign.
+        compared: the comparison with the earlier version.
 
     Raises:
         UserError: it cannot be written, or merge-sumo did not create the file in its place.
     """
-    compared = compare_against(run)
-    if compared is not None:
-        content = comparison_page(compared).encode(errors="backslashreplace")
-        replace_own(run.folder / AGAINST_PAGE, content, GENERATOR)
+    content = comparison_page(compared).encode(errors="backslashreplace")
+    replace_own(folder / AGAINST_PAGE, content, GENERATOR)
 
 
 def comparison_page(compared: Comparison) -> str:

@@ -1,4 +1,4 @@
-"""Cases of a campaign in the formats of other tools; nothing here loads libsumo."""
+"""Cases of a campaign in the formats of other tools."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ SIGNAL = "signal_"
 MERGED = "merged"
 """Column of scenarios with an acceleration lane: 1 where the VUT has left it, else 0."""
 FORMULA = ("=", "+", "-", "@")
-"""Beginnings of a formula in a spreadsheet."""
+"""First characters of a formula in a spreadsheet."""
 
 FORMATS = {
     "sumo": "folders that sumo-gui replays",
@@ -50,18 +50,23 @@ def export_cases(
 
     Args:
         run: the campaign.
-        indices: the cases; for tables none are all, for cases files at most 40 (`watching`).
+        indices: the cases. Without any, a table has all cases, and a cases file at most 40
+            (`watching`).
         file_format: the format.
-        target: new files or folders are made here; by default in the folder of the campaign.
+        target: new file, or folder for the new files; None for the folder of the campaign.
 
     Returns:
         The files to open.
 
     Raises:
-        UserError: before anything is written, for an unknown format, case or place.
+        UserError: a format or case is unknown, or a file exists; nothing is written then.
+
+    Example:
+        >>> export_cases(run, [12], "openscenario", Path("for-esmini"))
+        [PosixPath('for-esmini/case-12/case-12.xosc')]
     """
     if file_format not in FORMATS:
-        raise UserError(f"there is no format {file_format!r}: choose one of {', '.join(FORMATS)}")
+        raise UserError(f"no format {file_format!r}: choose one of {', '.join(FORMATS)}")
     if target is None:
         check_own(run.folder / SCENARIOS, run.folder / EXPORTS)
         target = run.folder / (SCENARIOS if file_format == "sumo" else EXPORTS)
@@ -84,14 +89,14 @@ def write_table(run: RecordedCampaign, indices: Sequence[int], target: Path) -> 
 
     Args:
         run: the campaign.
-        indices: the cases; none are all.
+        indices: the cases; all without any.
         target: the new file, or a folder for it.
 
     Returns:
         The path of the file.
 
     Raises:
-        UserError: if the file exists, or a case has no trajectory.
+        UserError: the file exists, or a case has no trajectory.
     """
     rows: list[dict[str, Any]] = []
     for index in indices or range(len(run.outcomes)):
@@ -109,7 +114,11 @@ def write_table(run: RecordedCampaign, indices: Sequence[int], target: Path) -> 
 
 
 def columns_of(scenario: Scenario) -> tuple[str, ...]:
-    """Return the columns of a table: time and motion of all vehicles, the case, its severity."""
+    """Return the columns of a table: time and motion of all vehicles, the case, its severity.
+
+    Args:
+        scenario: scenario of the campaign.
+    """
     columns = ["case", "level", "time_s", *_motion(scenario)]
     if scenario.lane_m is not None:
         columns.append(MERGED)
@@ -145,7 +154,7 @@ def _rows(run: RecordedCampaign, index: int) -> Iterator[dict[str, Any]]:
 
 
 def write_openscenario(run: RecordedCampaign, index: int, folder: Path, road: Road) -> Path:
-    """Write a case as OpenDRIVE and as two OpenSCENARIO files; return the path of the first.
+    """Write a case as an OpenDRIVE and two OpenSCENARIO files.
 
     In the first all cars follow their recorded trajectories. In the second, `...-free.xosc`, the
     VUT starts at its position and speed and has the controller that the parameter `EgoController`
@@ -161,37 +170,31 @@ def write_openscenario(run: RecordedCampaign, index: int, folder: Path, road: Ro
         folder: new folder to write.
         road: corridor of the scenario.
 
+    Returns:
+        The path of the first OpenSCENARIO file.
+
     Raises:
         UserError: the folder exists, or the case has no trajectory.
     """
     trajectory, name, scenario = run.trajectory(index), case_name(index), run.scenario
     cars = []
     for row, who in enumerate(VEHICLES[: scenario.vehicles]):
-        car = {
-            "name": who,
-            "length_m": scenario.vut_length_m if row == VUT else scenario.pov_length_m,
-            "first_mps": float(trajectory.motion[0, row, 1]),
-            "last_mps": float(trajectory.whole[-1, row, 1]),
-            "places": _places(road, trajectory, row),
-        }
-        cars.append(car)
+        v_mps = trajectory.whole[:, row, 1].tolist()
+        cars.append({"name": who, "v_mps": v_mps, "places": _places(road, trajectory, row)})
     files = {ROAD: opendrive(road)}
-    became = run.outcome(index).measures.result
-    for suffix, title, free in (("-free", "free VUT", True), ("", became, False)):
-        text = (
-            environment()
-            .get_template("scenario.xosc.jinja")
-            .render(
-                title=f"{run.vut}, {name}, {title}",
-                name=name,
-                scenario=scenario,
-                road=ROAD,
-                cars=cars,
-                free=free,
-                width_m=WIDTH_M,
-                dt_s=DT_S,
-                recorded_s=round((len(trajectory.whole) - 1) * DT_S, 1),
-            )
+    template = environment().get_template("scenario.xosc.jinja")
+    result = run.outcome(index).measures.result
+    for suffix, title, free in (("-free", "free VUT", True), ("", result, False)):
+        text = template.render(
+            title=f"{run.vut}, {name}, {title}",
+            name=name,
+            scenario=scenario,
+            road=ROAD,
+            cars=cars,
+            free=free,
+            width_m=WIDTH_M,
+            dt_s=DT_S,
+            recorded_s=round((len(trajectory.whole) - 1) * DT_S, 1),
         )
         files[f"{name}{suffix}.xosc"] = text.strip().encode()
     write_folder(folder, files)

@@ -1,7 +1,7 @@
-"""Pictures of experiments, drawn by matplotlib (the extra `plot`), and the page of a reproduction.
+"""Figures of experiments, drawn by matplotlib (the extra `plot`), and the page of a reproduction.
 
-A sampler and a level of the POV have a colour each in all pictures, which any kind of colour vision
-tells apart (Okabe and Ito, 2008).
+Each sampler and each POV level has one colour in all figures, which any kind of colour vision tells
+apart (Okabe and Ito, 2008).
 """
 
 from __future__ import annotations
@@ -53,7 +53,14 @@ STYLE: Any = {
 
 
 def check_figure(path: Path) -> None:
-    """Raise `UserError` where a figure cannot be drawn to `path`, before anything is run for it."""
+    """Check that a figure can be drawn later.
+
+    Args:
+        path: its new file.
+
+    Raises:
+        UserError: the file exists, has another ending, or matplotlib is not installed.
+    """
     check_new(path, "`figure`", KINDS)
     require_matplotlib()
 
@@ -67,10 +74,20 @@ def require_matplotlib() -> None:
 
 
 def save(figure: Figure, path: Path) -> None:
-    """Write a figure as PNG or SVG; `UserError` when the file exists or cannot be written."""
+    """Write a figure as PNG or SVG; the same numbers give the same file.
+
+    Args:
+        figure: the figure.
+        path: new file, whose ending is the format.
+
+    Raises:
+        UserError: the file exists or cannot be written.
+
+    Example:
+        >>> save(coverage_curves("design2", study), Path("curves.svg"))
+    """
     import matplotlib
 
-    # No date: the same numbers give the same file.
     kind = path.suffix[1:]
     metadata = {"Date": None} if kind == "svg" else {"Software": None}
     with io.BytesIO() as picture, matplotlib.rc_context(STYLE):
@@ -80,7 +97,7 @@ def save(figure: Figure, path: Path) -> None:
 
 @contextmanager
 def _drawing(title: str, width: float, height: float) -> Iterator[Figure]:
-    """Give a figure of a size in inches with a title alone, and our style while it is drawn."""
+    """Yield a figure of a size in inches with a title, in the style of the package."""
     require_matplotlib()
     import matplotlib
     from matplotlib.figure import Figure
@@ -92,12 +109,21 @@ def _drawing(title: str, width: float, height: float) -> Iterator[Figure]:
 
 
 def colour(name: str) -> str:
-    """Return the colour of a sampler, or of the truth."""
+    """Return the colour of a sampler, or of the truth.
+
+    Args:
+        name: name of the sampler, or `TRUTH`.
+    """
     return "#000000" if name == TRUTH else SAMPLERS[name].colour
 
 
 def coverage_curves(title: str, study: SamplerStudy) -> Figure:
-    """Draw FMC against cases: a median with its quartile band per sampler, truth, limit."""
+    """Draw FMC over cases: a median with its quartile band per sampler, truth, and limit.
+
+    Args:
+        title: title of the figure.
+        study: the study of samplers.
+    """
     with _drawing(title, 7.5, 4.6) as figure:
         axes = figure.subplots()
         for name, result in study.samplers.items():
@@ -118,8 +144,7 @@ def coverage_curves(title: str, study: SamplerStudy) -> Figure:
 def maps(title: str, panels: Mapping[str, Panel], level: int) -> Figure:
     """Draw cases and failures in the units of the pool, a panel per sampler.
 
-    Of two coordinates the discs around failures are those that FMC counts; of three the first two
-    are drawn.
+    With two coordinates the discs that FMC counts are drawn; with three, the first two coordinates.
 
     Args:
         title: title of the figure.
@@ -218,7 +243,12 @@ def predicted_margins(
 
 
 def allocation(title: str, by_sampler: Mapping[str, LevelBatches]) -> Figure:
-    """Draw cases per level and mean margin per level over the batches: median and quartile band."""
+    """Draw cases and mean margin of each level over batches: median and quartile band.
+
+    Args:
+        title: title of the figure.
+        by_sampler: cases and margins by level and batch, by sampler.
+    """
     with _drawing(title, 4.6 * len(by_sampler), 6.4) as figure:
         grid = figure.subplots(2, len(by_sampler), sharex=True, sharey="row", squeeze=False)
         for (above, below), (name, levels) in zip(grid.T, by_sampler.items(), strict=True):
@@ -247,14 +277,17 @@ def _band(axes: Axes, values: FloatArray, level: int) -> None:
 
 
 def write_reproduction(result: Reproduction, folder: Path) -> Path:
-    """Write the table, the figures and the page of a reproduction; return the path of the page.
+    """Write the table, the figures and the page of a reproduction.
 
     Args:
         result: the reproduction.
         folder: folder for the files.
 
+    Returns:
+        The path of the page.
+
     Raises:
-        UserError: a file is there already, or matplotlib is missing.
+        UserError: a file exists already, or matplotlib is not installed.
     """
     write_new(folder / "table2.json", to_json(result.to_record()))
     write_new(folder / "table2.md", ("\n".join(result.lines()) + "\n").encode())
@@ -263,9 +296,9 @@ def write_reproduction(result: Reproduction, folder: Path) -> Path:
         save(figure, folder / f"{name}.png")
         pictures.append(f"{name}.png")
     text = page("reproduce.html.jinja", result=result, table=table_ii(result), pictures=pictures)
-    page_file = folder / "index.html"
-    write_new(page_file, text.encode())
-    return page_file
+    index = folder / "index.html"
+    write_new(index, text.encode())
+    return index
 
 
 def _figures(result: Reproduction) -> Iterator[tuple[str, Figure]]:

@@ -159,7 +159,7 @@ class Counter(Bars):
     """A bar of finished items; `ended` is a callback of a study."""
 
     def __init__(self, title: str, total: int, unit: str, *, shown: bool | None = True) -> None:
-        """Begin to measure the rate.
+        """Show nothing yet.
 
         Args:
             title: title of the bar.
@@ -170,17 +170,20 @@ class Counter(Bars):
         super().__init__(shown=shown)
         self._title, self._total, self._unit = title, total, unit
         self._count = 0
-        self.ended(0)
 
-    def ended(self, count: int, note: str = "") -> None:
+    def __enter__(self) -> Self:
+        """Begin to measure the rate."""
+        self.ended(0)
+        return self
+
+    def ended(self, count: int) -> None:
         """Count items that have finished.
 
         Args:
             count: number of further items.
-            note: text after the bar.
         """
         self._count += count
-        self.counted(self._title, self._count, self._total, self._unit, note)
+        self.counted(self._title, self._count, self._total, self._unit)
 
 
 class CampaignBars(Bars):

@@ -34,7 +34,7 @@ from merge_sumo.reports.comparison_page import AGAINST_PAGE, write_against
 from merge_sumo.reports.facts import ERRORS, FAILURES, STARTS_THAT_FAIL, TIMEOUTS, by_level
 from merge_sumo.reports.pages import page
 from merge_sumo.reports.report_data import page_data, pairs_of
-from merge_sumo.reports.report_model import ReportModel
+from merge_sumo.reports.report_model import INDEX, ReportModel
 from merge_sumo.reports.text import comparison_headline, headline, robustness
 
 REPORT = "report.html"
@@ -60,8 +60,10 @@ def write_report(run: RecordedCampaign) -> Path:
     Raises:
         UserError: it cannot be written, or merge-sumo did not create the file in its place.
     """
-    _replace(run, report_page(run))
-    write_against(run)
+    model = ReportModel(run)
+    _replace(run, report_page(model))
+    if model.against is not None:
+        write_against(run.folder, model.against)
     return run.folder / REPORT
 
 
@@ -117,7 +119,7 @@ class RunningReport:
         self._is_there = False
         with suppress(UserError):
             run = RecordedCampaign(self._folder)
-            _replace(run, report_page(run, learns=False, running=running))
+            _replace(run, report_page(ReportModel(run, learns=False), running=running))
             self._is_there = True
 
 
@@ -134,18 +136,17 @@ def check_report(folder: Path) -> None:
     check_generated(folder / AGAINST_PAGE)
 
 
-def report_page(run: RecordedCampaign, *, learns: bool = True, running: bool = False) -> str:
+def report_page(model: ReportModel, *, running: bool = False) -> str:
     """Return the report of a campaign as HTML.
 
     Args:
-        run: the campaign.
-        learns: whether the page has surrogates.
+        model: the content of the report.
         running: whether the campaign runs; a browser then loads the page every few seconds.
 
     Example:
-        >>> html = report_page(ms.open_run("runs/latest").recorded, learns=False)
+        >>> html = report_page(ReportModel(ms.open_run("runs/latest").recorded, learns=False))
     """
-    model = ReportModel(run, learns=learns)
+    run = model.run
     warnings = [unrepeatable(read_second_runs(run)), mostly_clipped(run.cases)]
     notes = doubts(run.cases, run.criterion, run.settings.in_vain)
     if run.settings.ran_again:
@@ -158,6 +159,7 @@ def report_page(run: RecordedCampaign, *, learns: bool = True, running: bool = F
         scripts=("player.js", "report.js"),
         every_s=EVERY_S if running else 0,
         now=f"{datetime.now().astimezone():%H:%M:%S}",
+        index=str(INDEX),
         data=Markup(data),  # noqa: S704 (JSON without "<")
         model=model,
         warnings=filter(None, warnings),

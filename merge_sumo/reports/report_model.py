@@ -50,6 +50,7 @@ class ReportModel:
         worst: failures, the worst first.
         spread: the listed failures: the worst of each region first.
         near: cases that do not fail, those nearest to a failure first.
+        nearest: the listed ones of these.
         error_groups: messages of errors and timeouts, with the listed cases of each.
         shown: cases that the page holds one by one, in their order.
         regions: region of each failure, by its index.
@@ -57,8 +58,7 @@ class ReportModel:
         diagnoses: conduct of VUT and POV by index; lost motions have none.
         kinds: kind of each failure that has one, by its index.
         boxes: boxes of the pool where cases fail, by level.
-        explain: text of the commands that explain a case and write the report, up to the index of
-            the case, and after it.
+        explain: commands that explain the case `INDEX` and write the report.
 
     Example:
         >>> model = ReportModel(ms.open_run("runs/latest").recorded, learns=False)
@@ -108,13 +108,11 @@ class ReportModel:
         self.boxes: list[FailureBox] = []
         for level in self.levels:
             self.boxes += failure_boxes(self.worst + self.near, level)
-        explain = campaign_command("explain", run.folder, run.record, INDEX)
-        before, _, after = explain.partition(str(INDEX))
-        if explain.startswith("ms."):
-            after += f"; {call('report', run.folder)}"
+        self.explain = campaign_command("explain", run.folder, run.record, INDEX)
+        if self.explain.startswith("ms."):
+            self.explain += f"; {call('report', run.folder)}"
         else:
-            after += f" && {command('report', run.folder)}"
-        self.explain = before, after
+            self.explain += f" && {command('report', run.folder)}"
 
     def _choose_cases(self) -> None:
         """Choose the cases that are listed, and those that the page holds one by one."""
@@ -133,12 +131,13 @@ class ReportModel:
             self.spread.sort(key=lambda outcome: outcome.index not in robust)
         self.spread = self.spread[:LISTED]
         self.near = sorted(passing, key=lambda outcome: (outcome.margin, outcome.index))
+        self.nearest = self.near[:LISTED]
         self.error_groups: list[tuple[ErrorGroup, list[Outcome]]] = []
         first: list[Outcome] = []
         for group in self.summary.error_groups[:LISTED]:
             examples = [self.run.outcome(index) for index in group.cases[:LISTED]]
             self.error_groups.append((group, examples))
             first += examples
-        first += self.spread + self.near[:LISTED] + self.worst + untested + self.near
+        first += self.spread + self.nearest + self.worst + untested + self.near
         by_index = {outcome.index: outcome for outcome in first}
         self.shown = sorted(list(by_index.values())[:SHOWN], key=lambda outcome: outcome.index)

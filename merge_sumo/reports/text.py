@@ -23,7 +23,6 @@ from merge_sumo.analysis.explanation import PSI, Axis, Explanation, ExplanationR
 from merge_sumo.analysis.probability import Estimate, PerMerge, ProbabilityResult
 from merge_sumo.analysis.reproduction import ADAPTIVE, SAMPLERS, Reproduction
 from merge_sumo.analysis.sampler_study import SamplerStudy, Spread
-from merge_sumo.analysis.share import SHARES
 from merge_sumo.analysis.stress import StressResult
 from merge_sumo.analysis.truth import DENSE_CASES, REAL_REGION, Truth, TruthResult
 from merge_sumo.analysis.vut_check import VutCheck
@@ -117,7 +116,7 @@ def headline(run: RecordedCampaign, facts: Sequence[Fact]) -> list[str]:
         cases = f"{of[CASES].shown} of {of[AT_MOST].shown} cases, converged"
     lines = [f"{of[VUT].shown}: {RULE} {of[RULE].shown}; {cases}"]
     rows = []
-    is_measured = PROBABILITY_TO_FAIL in of or SHARES.read(run.folder) is not None
+    is_measured = PROBABILITY_TO_FAIL in of
     for level, row in levels.items():
         is_measured |= STARTS_THAT_FAIL in row
         rows.append(_level_cells(level, row))

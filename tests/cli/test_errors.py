@@ -21,9 +21,9 @@ from merge_sumo.scenario.scenario import US23
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("ttc_s < 2 or TTC_S < 1", "there is no measure 'TTC_S': did you mean ttc_s"),
+        ("ttc_s < 2 or TTC_S < 1", "no measure 'TTC_S': did you mean ttc_s"),
         ("merged_first == VUT", 'write the text in quotes: merged_first == "VUT"'),
-        ("merged_first == level0", "there is no measure 'level0'"),
+        ("merged_first == level0", "no measure 'level0'"),
         ("end == 'timeout'", "end is never 'timeout': did you mean TIMEOUT?"),
         ("ttc_s = 2", "instead of ="),
         ("ttc_s < 2 && dx_m > 3", "instead of &&"),

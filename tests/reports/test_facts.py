@@ -19,6 +19,7 @@ from merge_sumo.campaigns.recorded import RecordedCampaign, failures
 from merge_sumo.reports import report_model
 from merge_sumo.reports.facts import CONTACT, Fact
 from merge_sumo.reports.report import report_page
+from merge_sumo.reports.report_model import ReportModel
 from merge_sumo.reports.text import headline
 
 
@@ -34,7 +35,7 @@ def made(tmp_path_factory) -> RecordedCampaign:
 
 @pytest.fixture(scope="module")
 def page(made) -> Any:
-    return html.fromstring(report_page(made, learns=False))
+    return html.fromstring(report_page(ReportModel(made, learns=False)))
 
 
 @pytest.fixture(scope="module")
@@ -117,7 +118,7 @@ def test_of_the_headline_begin_terminal_and_report(made, page):
 def test_of_the_headline_name_the_option_of_another_rule_in_the_report(made, monkeypatch):
     facts = [*CampaignRun(made).facts, Fact(CONTACT, 2, "severity")]
     monkeypatch.setattr(report_model, "facts_of", lambda *_: facts)
-    page: Any = html.fromstring(report_page(made, learns=False))
+    page: Any = html.fromstring(report_page(ReportModel(made, learns=False)))
     (card,) = page.xpath("//section[@aria-labelledby='headline']//pre")
     said = "contact after the merge in 2 more cases: --fail-when unsafe counts them"
     assert said in card.text

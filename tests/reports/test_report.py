@@ -20,6 +20,7 @@ from merge_sumo.controllers.process import LINES, LOG
 from merge_sumo.reports import report_model
 from merge_sumo.reports.report import report_page
 from merge_sumo.reports.report_data import SPEED_UNIT_MPS
+from merge_sumo.reports.report_model import ReportModel
 from merge_sumo.scenario.case import to_unit
 from merge_sumo.scenario.scenario import DT_S, US23
 
@@ -33,7 +34,7 @@ def made(tmp_path_factory) -> RecordedCampaign:
 
 @pytest.fixture(scope="module")
 def page(made) -> str:
-    return report_page(made)
+    return report_page(ReportModel(made))
 
 
 def root_of(page: str) -> Any:
@@ -74,7 +75,7 @@ class TestThePage:
 
     def test_shows_what_comes_from_outside_as_text(self, tmp_path):
         run = write_run(tmp_path / "run", vut=EVIL, errors={179: EVIL}, sampler=EVIL)
-        page = report_page(run, learns=False)
+        page = report_page(ReportModel(run, learns=False))
         root = root_of(page)
         assert len(root.xpath("//script")) == 2
         assert root.xpath("//img | //@onerror") == []
@@ -98,7 +99,7 @@ def broken(tmp_path_factory) -> str:
     errors = {3: f"{EVIL}\x1b[31m", 6: f"{EVIL}\x1b[31m", 9: "other"}
     folder = tmp_path_factory.mktemp("broken") / "run"
     run = write_run(folder, 20, errors=errors, timeouts=(0, 1, 2, 4))
-    return report_page(run, learns=False)
+    return report_page(ReportModel(run, learns=False))
 
 
 class TestWhatWasNotTested:
@@ -116,7 +117,7 @@ class TestWhatWasNotTested:
         run = write_run(tmp_path / "run", 10, errors={})
         lines = [f"line {n} </pre><script>" for n in range(1000)]
         (run.folder / LOG).write_text("\x1b[31m" + "\n".join(lines), encoding="utf-8")
-        page = report_page(run, learns=False)
+        page = report_page(ReportModel(run, learns=False))
         (shown,) = root_of(page).xpath("//section[@aria-labelledby='about']//pre")
         assert shown.text.splitlines() == lines[-LINES:]
 
@@ -138,7 +139,7 @@ class TestTheMotion:
 class TestALongCampaign:
     def test_shows_some_cases_and_counts_the_others(self, made, monkeypatch):
         monkeypatch.setattr(report_model, "SHOWN", 50)
-        page = report_page(made, learns=False)
+        page = report_page(ReportModel(made, learns=False))
         data = data_of(page)
         assert len(data["cases"]["index"]) == 50
         counted = 0
