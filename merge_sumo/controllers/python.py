@@ -85,8 +85,8 @@ class OfPython(ControllerKind):
             UserError: if it cannot be called as a VUT, or has no such parameter.
         """
         self._target = target = self.target()
-        self._is_function, self._is_class = inspect.isroutine(target), isinstance(target, type)
-        if self._is_function:
+        self.is_function, self._is_class = inspect.isroutine(target), isinstance(target, type)
+        if self.is_function:
             check_call(target, ("seen",))
         else:
             check_methods(target)
@@ -102,7 +102,7 @@ class OfPython(ControllerKind):
         for name, value in self.spec.numbers().items():
             if name in defaults:
                 self._keywords[name] = value
-            elif self._is_function:
+            elif self.is_function:
                 raise self.spec.unknown_parameter(name, defaults)
             else:
                 self._attributes[name] = value
@@ -152,7 +152,7 @@ class OfPython(ControllerKind):
             UserError: if it cannot be made, or has no such parameter.
         """
         target = self._target
-        if self._is_function:
+        if self.is_function:
             return partial(target, **self._keywords) if self._keywords else target
         if self._is_batched and not (self._is_class or self._attributes):
             return target
@@ -179,7 +179,7 @@ class OfPython(ControllerKind):
         Args:
             made: what `make` returned.
         """
-        return ({} if self._is_function else attributes_of(made)) | self._numbers
+        return ({} if self.is_function else attributes_of(made)) | self._numbers
 
 
 class PythonKind(OfPython):
@@ -268,8 +268,7 @@ class PythonController(Controller):
         self._kind, self._thing = kind, kind.make()
         # The driver calls the user's function itself: a frame less in each step.
         self.act = getattr(self._thing, "act", self._thing)  # type: ignore[method-assign]
-        is_function = inspect.isroutine(self._thing) or isinstance(self._thing, partial)
-        self.single_use = not is_function and getattr(self._thing, "reset", None) is None
+        self.single_use = not kind.is_function and getattr(self._thing, "reset", None) is None
 
     def reset(self, start: Start) -> None:
         """Call `reset`, if the object has it.

@@ -65,7 +65,7 @@ class MeasureContract:
         points = np.random.default_rng(0).random((10, 2))
         values = []
         for case in self.pool.cases(points, self.pool.levels[0]):
-            values.append(self.measure.of(Measures(episode(case))))
+            values.append(self.measure.function(Measures(episode(case))))
         return values
 
     def test_says_what_it_is(self) -> None:
@@ -86,7 +86,7 @@ class MeasureContract:
         (case,) = self.pool.cases(np.full((1, 2), 0.5), self.pool.levels[0])
         trajectory = episode(case)
         before = trajectory.motion.copy()
-        self.measure.of(Measures(trajectory))
+        self.measure.function(Measures(trajectory))
         assert np.array_equal(before, trajectory.motion)
 
 

@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from merge_sumo.controllers.controller import ControllerDriver, Start
 from merge_sumo.controllers.process import (
     ENDING_S,
     ProcessDiedError,
@@ -31,7 +32,7 @@ from merge_sumo.drivers.base import MERGE, STAY, ControllerDiedError, Driver, Sc
 from merge_sumo.errors import UserError
 from merge_sumo.files import check_code
 from merge_sumo.road.road import Road
-from merge_sumo.scenario.case import Case, FloatArray
+from merge_sumo.scenario.case import FloatArray
 from merge_sumo.scenario.scenario import DT_S, VEHICLES, VUT, Scenario
 from merge_sumo.sumo.sumo_simulation import SumoSimulation
 
@@ -115,7 +116,7 @@ class TraciKind(ControllerKind):
         return TraciVut(self, simulation.road, simulation.scenario)
 
 
-class TraciVut(Driver):
+class TraciVut(ControllerDriver):
     """Drives as a TraCI client commands; one client has one vehicle `vut`, so one corridor.
 
     Each `simulationStep` of the client is a step of the rollout. The speed that SUMO gives the VUT
@@ -144,7 +145,6 @@ class TraciVut(Driver):
         self._listener: socket.socket | None = None
         self._client: socket.socket | None = None
         self._program: Program | None = None
-        self._reason: str | None = None
         self._in_vain: set[str] = set()
         self._before_mps: dict[str, float] = {}
         """Speeds of the vehicles a step ago."""
@@ -153,21 +153,21 @@ class TraciVut(Driver):
         self._patience_s = self._options.connect_s
         try:
             self._connect()
-        except (FaultError, ControllerDiedError) as error:
+        except BaseException as error:
             self.close()
-            raise UserError(str(error)) from error
-        except BaseException:
-            self.close()
+            if isinstance(error, FaultError | ControllerDiedError):
+                raise UserError(str(error)) from error
             raise
 
-    def begin(self, corridor: int, case: Case) -> None:
+    def reset(self, corridor: int, start: Start) -> None:
         """Note that the next scene is the first of an episode.
 
         Args:
             corridor: 0.
-            case: the case.
+            start: first observation of the episode.
         """
-        self._reason, self._seed = None, case.controller_seed
+        self._seed = start.seed
+        self._reasons.clear()
         self._before_mps.clear()
         self._in_vain.clear()
 
@@ -180,21 +180,13 @@ class TraciVut(Driver):
         Raises:
             ControllerDiedError: if the serving process has ended.
         """
-        if self._reason is None:
+        if not self._reasons:
             try:
                 return np.array([self._acceleration_mps2(scene)])
             except FaultError as error:
-                self._reason = str(error)
+                self._reasons[0] = str(error)
                 self._disconnect()
         return np.array([math.nan])
-
-    def reason(self, corridor: int) -> str | None:
-        """Return the fault of the client in this episode; None without one.
-
-        Args:
-            corridor: 0.
-        """
-        return self._reason
 
     def in_vain(self, corridor: int) -> Collection[str]:
         """Return the commands of the client that changed nothing in this episode.
