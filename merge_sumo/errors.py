@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import sys
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from types import FrameType
 
 MOST_CHARACTERS = 10_000
@@ -24,6 +26,19 @@ class UserError(Exception):
     def _render_traceback_(self) -> list[str]:
         """Return the lines that a notebook shows: the sentence without a traceback."""
         return [f"{type(self).__name__}: {self}", *getattr(self, "__notes__", ())]
+
+
+@contextmanager
+def explained(clause: str) -> Iterator[None]:
+    """Within `with`, put a clause in front of the sentence of a `UserError`.
+
+    Args:
+        clause: what is wrong; the sentence says why.
+    """
+    try:
+        yield
+    except UserError as error:
+        raise type(error)(f"{clause}: {error}") from error
 
 
 class ControllerError(UserError):

@@ -44,6 +44,19 @@ class TakenError(UserError):
     """There is something else at the place of an output."""
 
 
+@contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """Within `with`, an error of the system is a `UserError` that names what cannot be written.
+
+    Args:
+        path: the file or the folder.
+    """
+    try:
+        yield
+    except OSError as error:
+        raise UserError(f"cannot write {path}: {error.strerror or error}") from error
+
+
 def regular(path: Path) -> Path:
     """Return the path of a file to read.
 
@@ -90,22 +103,18 @@ def check_new(path: Path, option: str = "`out`", endings: Sequence[str] = ()) ->
     if os.path.lexists(path):
         raise _exists(path, option)
     try:
-        with suppress(FileNotFoundError):
+        with writing(path), suppress(FileNotFoundError):
             (path / LONG_NAME).lstat()
     except ValueError as error:
         raise UserError(f"{option} is {str(path)!r}: no file can have that name") from error
-    except OSError as error:
-        raise cannot_write(path, error) from error
     parent = path.parent
     while not os.path.lexists(parent) and parent != parent.parent:
         parent = parent.parent
     if not parent.is_dir():
         raise UserError(f"cannot write {path}: {parent} is not a folder")
-    try:
+    with writing(path):
         # On Linux the file never has a name: nothing changes in the folder.
         tempfile.TemporaryFile(dir=parent).close()
-    except OSError as error:
-        raise cannot_write(path, error) from error
 
 
 def check_own(*paths: Path) -> None:
@@ -118,12 +127,11 @@ def check_own(*paths: Path) -> None:
         paths: files and folders of merge-sumo, which may not exist.
     """
     for path in paths:
-        try:
-            mode = path.lstat().st_mode
-        except (FileNotFoundError, NotADirectoryError):
-            continue
-        except OSError as error:
-            raise cannot_write(path, error) from error
+        with writing(path):
+            try:
+                mode = path.lstat().st_mode
+            except (FileNotFoundError, NotADirectoryError):
+                continue
         if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
             what = "a link" if stat.S_ISLNK(mode) else "not a file"
             raise UserError(f"cannot write {path}: it is {what}; remove it")
@@ -138,12 +146,11 @@ def check_generated(path: Path, mark: bytes = GENERATOR) -> None:
             the generator of a page.
     """
     check_own(path)
-    try:
-        content = path.read_bytes()
-    except FileNotFoundError:
-        return
-    except OSError as error:
-        raise cannot_write(path, error) from error
+    with writing(path):
+        try:
+            content = path.read_bytes()
+        except FileNotFoundError:
+            return
     if content and mark not in content:
         raise UserError(f"{path} was not created by merge-sumo and is not overwritten: move it")
 
@@ -163,10 +170,8 @@ def make_folder(path: Path, option: str = "`out`", *, exist_ok: bool = False) ->
         if exist_ok and path.name not in ("", "..") and path.is_dir():
             return
     check_new(path, option)
-    try:
+    with writing(path):
         path.mkdir(parents=True)
-    except OSError as error:
-        raise cannot_write(path, error) from error
 
 
 def write_folder(path: Path, files: Mapping[str, bytes]) -> None:
@@ -184,7 +189,7 @@ def write_folder(path: Path, files: Mapping[str, bytes]) -> None:
         return
     check_new(path)
     new = _temporary_name(path)
-    try:
+    with writing(path):
         new.mkdir(parents=True)
         try:
             for name, content in files.items():
@@ -196,8 +201,6 @@ def write_folder(path: Path, files: Mapping[str, bytes]) -> None:
             shutil.rmtree(new, ignore_errors=True)
             raise
         sync_folder(path.parent)
-    except OSError as error:
-        raise cannot_write(path, error) from error
 
 
 def _holds(path: Path, files: Mapping[str, bytes]) -> bool:
@@ -221,23 +224,19 @@ def new_file(path: Path, option: str = "`out`") -> Iterator[BinaryIO]:
     Raises:
         UserError: something is there, or it cannot be written.
     """
-    try:
+    with writing(path):
         if os.path.lexists(path):
-            raise FileExistsError
+            raise _exists(path, option)
         path.parent.mkdir(parents=True, exist_ok=True)
         with _temporary(path) as (new, file):
             yield file
             file.flush()
             try:
-                os.link(new, path, follow_symlinks=False)  # refuses a name that was taken since
-            except FileExistsError:
-                raise
+                os.link(new, path, follow_symlinks=False)  # refuses a name taken since
+            except FileExistsError as error:
+                raise _exists(path, option) from error
             except (OSError, NotImplementedError):  # a file system without hard links
                 new.rename(path)
-    except FileExistsError as error:
-        raise _exists(path, option) from error
-    except OSError as error:
-        raise cannot_write(path, error) from error
 
 
 def write_new(path: Path, content: bytes, option: str = "`out`") -> None:
@@ -267,13 +266,11 @@ def replace_own(path: Path, content: bytes, mark: bytes = b"") -> None:
         UserError: something else is there, or it cannot be written.
     """
     check_generated(path, mark)
-    try:
+    with writing(path):
         with _temporary(path) as (new, file):
             _sync(file, content)
             new.replace(path)
         sync_folder(path.parent)
-    except OSError as error:
-        raise cannot_write(path, error) from error
 
 
 def _temporary_name(path: Path) -> Path:
@@ -353,16 +350,6 @@ def link_latest(folder: Path) -> None:
         new = _temporary_name(link)
         new.symlink_to(folder.name, target_is_directory=True)
         new.replace(link)
-
-
-def cannot_write(path: Path, error: OSError) -> UserError:
-    """Return the error for a path that cannot be written.
-
-    Args:
-        path: the path.
-        error: why it cannot be written.
-    """
-    return UserError(f"cannot write {path}: {error.strerror or error}")
 
 
 def _exists(path: Path, option: str) -> TakenError:

@@ -37,7 +37,7 @@ import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
-from merge_sumo.errors import UserError
+from merge_sumo.errors import UserError, explained
 from merge_sumo.files import read_limited, regular
 from merge_sumo.printable import meant
 
@@ -111,13 +111,13 @@ def read_record(path: Path, kind: type[T]) -> T | None:
         UserError: the file is not as it was written.
     """
     try:
-        known: T = decode(read_limited(path, MAX_RECORD_BYTES), kind)
+        content = read_limited(path, MAX_RECORD_BYTES)
     except FileNotFoundError:
         return None
     except OSError as error:
         raise UserError(f"{path} cannot be read: {error.strerror}") from error
-    except UserError as error:
-        raise UserError(f"{path} is not as it was written: {error}") from error
+    with explained(f"{path} is not as it was written"):
+        known: T = decode(content, kind)
     return known
 
 
@@ -195,15 +195,12 @@ def read_indexed(path: Path, kind: type[T], indices: Container[int]) -> list[T]:
         raise RecordError(f"{path} cannot be read: {error.strerror}") from error
     values: dict[Any, T] = {}
     for number, line in enumerate(lines, start=1):
-        try:
+        with explained(f"line {number} of {path} is not as it was written"):
             value: Any = convert(decode(line, dict[str, Any]), kind)
             # A case may have a line for each VUT.
             key = value.index, getattr(value, "vut", None)
             if value.index not in indices or key in values:
                 raise RecordError(f"it is of case {value.index}, of which no such line can be")
-        except UserError as error:
-            line_of = f"line {number} of {path}"
-            raise RecordError(f"{line_of} is not as it was written: {error}") from error
         values[key] = value
     return list(values.values())
 

@@ -30,12 +30,12 @@ from merge_sumo.campaigns.recorded import (
 )
 from merge_sumo.errors import UserError
 from merge_sumo.files import (
-    cannot_write,
     check_own,
     make_folder,
     replace_own,
     sync_folder,
     write_folder,
+    writing,
 )
 from merge_sumo.metrics.outcome import Episode, Outcome
 from merge_sumo.records import to_json
@@ -109,18 +109,15 @@ class Journal:
         """
         check_own(*(folder / name for name in (SETTINGS, OUTCOMES, TRAJECTORIES)))
         check_own(*(folder / TRAJECTORIES).glob("*"))
-        with ExitStack() as opened:
-            try:
-                outcomes = (folder / OUTCOMES).open("r+b", buffering=0)
-                journal = cls(folder, opened.enter_context(outcomes), {})
-                run = RecordedCampaign(folder)
-                journal.settings = run.record
-                whole = run.whole_batches()
-                dropped = len(run.outcomes) - whole + run.torn
-                if dropped:
-                    journal.keep(run, whole)
-            except OSError as error:
-                raise cannot_write(folder, error) from error
+        with writing(folder), ExitStack() as opened:
+            outcomes = (folder / OUTCOMES).open("r+b", buffering=0)
+            journal = cls(folder, opened.enter_context(outcomes), {})
+            run = RecordedCampaign(folder)
+            journal.settings = run.record
+            whole = run.whole_batches()
+            dropped = len(run.outcomes) - whole + run.torn
+            if dropped:
+                journal.keep(run, whole)
             opened.pop_all()
         return journal, run, dropped
 
@@ -156,23 +153,21 @@ class Journal:
         episodes = list(chain.from_iterable(batches))
         lines = "".join(to_line(episode.outcome) for episode in episodes)
         try:
-            end = self._outcomes.seek(0, os.SEEK_END)
-            for batch in batches:
-                path = batch_file(self.folder, batch[0].outcome.batch)
-                with path.open("wb", buffering=0) as file:
-                    _write_all(file, _arrays(batch))
-            sync_folder(self.folder / TRAJECTORIES)
-            try:
-                _write_all(self._outcomes, lines.encode())
-            except OSError:
-                self._outcomes.truncate(end)
-                raise
-        except OSError as error:
+            with writing(self.folder):
+                for batch in batches:
+                    path = batch_file(self.folder, batch[0].outcome.batch)
+                    with path.open("wb", buffering=0) as file:
+                        _write_all(file, _arrays(batch))
+                sync_folder(self.folder / TRAJECTORIES)
+                end = self._outcomes.seek(0, os.SEEK_END)
+                try:
+                    _write_all(self._outcomes, lines.encode())
+                except OSError:
+                    self._outcomes.truncate(end)
+                    raise
+        except UserError as error:
             resume = campaign_command("resume", self.folder, self.settings)
-            raise UserError(
-                f"{cannot_write(self.folder, error)}; when it can be written, continue with "
-                f"`{resume}`"
-            ) from error
+            raise UserError(f"{error}; when it can be written, continue with `{resume}`") from error
         before = dict(self.settings)
         for episode in episodes:
             self._note(episode)

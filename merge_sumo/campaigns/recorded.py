@@ -10,8 +10,8 @@ against/                  the same of the earlier version, where a campaign is a
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, fields, replace
 from itertools import groupby
 from pathlib import Path
@@ -22,7 +22,7 @@ from msgspec import Meta
 from numpy.typing import NDArray
 
 from merge_sumo.config import MOST_CASES, Search
-from merge_sumo.errors import UserError
+from merge_sumo.errors import UserError, explained
 from merge_sumo.files import regular
 from merge_sumo.metrics.criterion import PAPER_CRITERION, Criterion
 from merge_sumo.metrics.fmc import fmc, regions
@@ -127,17 +127,13 @@ class RecordedCampaign:
         """By index, of the batches that were read."""
         names = {field.name for field in fields(RecordedSettings)}
         known = {name: value for name, value in record.items() if name in names}
-        try:
+        with explained(f"{place} does not describe a campaign"):
             self.settings = convert(known, RecordedSettings)
-        except UserError as error:
-            raise UserError(f"{place} does not describe a campaign: {error}") from error
 
     def _read(self) -> None:
         path = self.folder / OUTCOMES
-        try:
+        with _reading(self.folder):
             text = regular(path).read_bytes()
-        except OSError as error:
-            raise _no_campaign(self.folder, error) from error
         self.outcomes, self.torn = read_outcomes(text, str(path), self.scenario)
         for outcome in self.outcomes:
             needs = not (self.criterion.is_papers or outcome.measures.end.is_error)
@@ -347,12 +343,8 @@ def read_settings(folder: Path) -> dict[str, Any]:
         UserError: it is not that of a campaign.
     """
     path = folder / SETTINGS
-    try:
+    with _reading(folder), explained(f"{path} does not describe a campaign"):
         settings: dict[str, Any] = decode(regular(path).read_bytes(), dict[str, Any])
-    except OSError as error:
-        raise _no_campaign(folder, error) from error
-    except UserError as error:
-        raise UserError(f"{path} does not describe a campaign: {error}") from error
     return settings
 
 
@@ -367,10 +359,8 @@ def recorded_scenario(settings: Mapping[str, Any], path: Path) -> Scenario:
         UserError: the scenario is not one.
     """
     recorded = settings.get("scenario")
-    try:
+    with explained(f"{path} has no scenario"):
         return US23 if recorded is None else convert(recorded, Scenario)
-    except UserError as error:
-        raise UserError(f"{path} has no scenario: {error}") from error
 
 
 def read_outcomes(text: bytes, name: str, scenario: Scenario) -> tuple[list[Outcome], bool]:
@@ -390,14 +380,10 @@ def read_outcomes(text: bytes, name: str, scenario: Scenario) -> tuple[list[Outc
     outcomes: list[Outcome] = []
     *lines, rest = text.split(b"\n")
     for number, line in enumerate(lines, start=1):
-        try:
+        with explained(f"line {number} of {name} is not the outcome of case {number - 1}"):
             outcome = Outcome.from_json(line, scenario)
             if outcome.index != number - 1:
                 raise UserError(f"index is {outcome.index}")
-        except UserError as error:
-            raise UserError(
-                f"line {number} of {name} is not the outcome of case {number - 1}: {error}"
-            ) from error
         outcomes.append(outcome)
     return outcomes, bool(rest)
 
@@ -488,11 +474,16 @@ def batch_file(folder: Path, batch: int) -> Path:
     return folder / TRAJECTORIES / f"{batch:05d}.npz"
 
 
-def _no_campaign(folder: Path, error: OSError) -> UserError:
-    return UserError(
-        f"{folder} is not a campaign: cannot read {error.filename} ({error.strerror}); name a "
-        "folder that `merge-sumo campaign` has written"
-    )
+@contextmanager
+def _reading(folder: Path) -> Iterator[None]:
+    """Within `with`, a file that cannot be read is a `UserError` on its folder."""
+    try:
+        yield
+    except OSError as error:
+        raise UserError(
+            f"{folder} is not a campaign: cannot read {error.filename} ({error.strerror}); name a "
+            "folder that `merge-sumo campaign` has written"
+        ) from error
 
 
 def _motion_by_case(vehicles: int, arrays: Mapping[str, NDArray[Any]]) -> dict[int, FloatArray]:

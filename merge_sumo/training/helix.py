@@ -32,7 +32,7 @@ from merge_sumo.drivers.policies import (
     scenario_record,
 )
 from merge_sumo.errors import UserError
-from merge_sumo.files import cannot_write, check_own, make_folder, replace_own, write_new
+from merge_sumo.files import check_own, make_folder, replace_own, write_new, writing
 from merge_sumo.printable import quoted
 from merge_sumo.records import to_json, to_plain
 from merge_sumo.result import Result
@@ -149,13 +149,11 @@ def _make_library(folder: Path) -> None:
     check_own(manifest, *files)
     if manifest.is_file():
         return
-    try:
+    with writing(folder):
         if any(folder.iterdir()):
             raise UserError(
                 f"{folder} holds other things than policies: choose another folder with `out`"
             )
-    except OSError as error:
-        raise cannot_write(folder, error) from error
     write_new(manifest, to_json({"networks": {}}, indent=2))
 
 
