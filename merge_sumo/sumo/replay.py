@@ -38,7 +38,6 @@ from merge_sumo.scenario.scenario import (
 )
 from merge_sumo.scenario.trajectory import Trajectory, cut_at
 from merge_sumo.sumo.binding import run_program, scratch_folder
-from merge_sumo.sumo.net_copies import hosted_net
 from merge_sumo.sumo.replay_folder import (
     CASE,
     CONFIG,
@@ -47,7 +46,6 @@ from merge_sumo.sumo.replay_folder import (
     NET,
     RECORD,
     SCENARIO,
-    ReplayRoad,
     case_line,
     files_of,
     motion_record,
@@ -200,7 +198,7 @@ def open_gui(folder: Path, from_s: float | None = None, *, silent: bool = False)
 class _Episode:
     """The content of a replay folder, with a record of `COLUMNS`, (T, A, 4)."""
 
-    road: ReplayRoad
+    road: Road
     outcome: Outcome
     trajectory: Trajectory
     record: FloatArray
@@ -224,7 +222,7 @@ def _read(folder: Path) -> _Episode:
             f"{name} must have {', '.join(VEHICLES[:cars])} every {DT_S:g} s, in {1 + HOLD_STEPS} "
             "or more rows"
         )
-    motion = _motion(record, lanes, road.road, name)
+    motion = _motion(record, lanes, road, name)
     measures = outcome.measures
     end = round(measures.t_end_s / DT_S)
     if not 0 <= end < len(motion):
@@ -246,15 +244,14 @@ def _outcome(path: Path) -> Outcome:
         raise UserError(f"{path} is not the case of a replay: {error}") from error
 
 
-def _road(path: Path, outcome: Outcome) -> ReplayRoad:
+def _road(path: Path, outcome: Outcome) -> Road:
     content = read_xml(path, "the net")
-    if path.name == NET:
-        shipped = road_of()
-        if content != shipped.path.read_bytes():
-            raise UserError(f"{path} is not the net of this version: export the case again")
-        return ReplayRoad(content, shipped, NET)
-    road = road_of_hosted(content, path, outcome.case.scenario.lane_m)
-    return ReplayRoad(hosted_net(road, 1, lane_goes_on=True), road, HOSTED_NET)
+    if path.name == HOSTED_NET:
+        return road_of_hosted(content, path, outcome.case.scenario.lane_m)
+    shipped = road_of()
+    if content != shipped.path.read_bytes():
+        raise UserError(f"{path} is not the net of this version: export the case again")
+    return shipped
 
 
 def _record(path: Path, name: str) -> tuple[FloatArray, dict[tuple[int, int], str]]:
@@ -314,7 +311,7 @@ def _staged(episode: _Episode, first: int) -> Iterator[tuple[Path, list[str]]]:
     SUMO begins one row before `first`. It inserts each vehicle where it last was outside of
     junctions: the route of the vehicle begins there, and decides between lanes that overlap.
     """
-    record = motion_record(episode.road.road, episode.trajectory)
+    record = motion_record(episode.road, episode.trajectory)
     row = max(first - 1, 0)
     inserted = {}
     for step in [*record][: row + 1]:

@@ -87,21 +87,6 @@ class Picture:
         return self.x_m + right * self.width_m, self.y_m + up * self.width_m * SHAPE
 
 
-@dataclass(frozen=True, slots=True)
-class ReplayRoad:
-    """The road of a replay folder.
-
-    Attributes:
-        net: content of the net file of the folder.
-        road: the road in that net.
-        file: name of the net file.
-    """
-
-    net: bytes
-    road: Road
-    file: str
-
-
 def write_scenario(folder: Path, road: Road, outcome: Outcome, trajectory: Trajectory) -> Path:
     """Write an episode as a replay folder.
 
@@ -117,24 +102,23 @@ def write_scenario(folder: Path, road: Road, outcome: Outcome, trajectory: Traje
     Raises:
         UserError: something else is there, or the folder cannot be written.
     """
-    written = _road(road, folder)
+    road = _road_of_folder(road, folder)
     scenario = outcome.case.scenario.to_record() | {"net": None}
     case = to_json({SCENARIO: scenario, **outcome.to_record()}, indent=2)
-    record = motion_record(written.road, trajectory)
-    write_folder(folder, {CASE: case, **files_of(written, outcome, trajectory, record)})
+    record = motion_record(road, trajectory)
+    write_folder(folder, {CASE: case, **files_of(road, outcome, trajectory, record)})
     return folder / CONFIG
 
 
-def _road(road: Road, folder: Path) -> ReplayRoad:
-    """Return a road as a folder has it."""
+def _road_of_folder(road: Road, folder: Path) -> Road:
+    """Return a road with the lanes of the net of a folder."""
     shipped = road_of()
     identity = attrgetter("sha256", "mainline_edges", "ramp_edges")
     if identity(road) == identity(shipped):
-        return ReplayRoad(shipped.path.read_bytes(), shipped, NET)
+        return shipped
     fast = replace(road, mainline=_fast(road.mainline), ramp=_fast(road.ramp))
     net = hosted_net(fast, 1, lane_goes_on=True)
-    hosted = road_of_hosted(net, folder / HOSTED_NET, fast.lane_m)
-    return ReplayRoad(net, hosted, HOSTED_NET)
+    return road_of_hosted(net, folder / HOSTED_NET, fast.lane_m)
 
 
 def _fast(path: LanePath) -> LanePath:
@@ -180,12 +164,12 @@ def road_of_hosted(content: bytes, path: Path, lane_m: Bounds | None) -> Road:
 
 
 def files_of(
-    road: ReplayRoad, outcome: Outcome, trajectory: Trajectory, record: etree._Element
+    road: Road, outcome: Outcome, trajectory: Trajectory, record: etree._Element
 ) -> dict[str, bytes]:
     """Return the files of an episode that SUMO reads.
 
     Args:
-        road: road of the folder.
+        road: road with the lanes of the net of the folder.
         outcome: outcome of the case.
         trajectory: motion of the case.
         record: the part of `motion_record` that SUMO plays.
@@ -193,15 +177,20 @@ def files_of(
     Returns:
         The contents by name, the configuration last.
     """
-    picture = _picture(road.road, record)
+    shipped = road_of()
+    if road == shipped:
+        file, net = NET, shipped.path.read_bytes()
+    else:
+        file, net = HOSTED_NET, hosted_net(road, 1, lane_goes_on=True)
+    picture = _picture(road, record)
     roots = {
         TYPES: _types(trajectory),
         LABELS: _labels(outcome, trajectory, picture),
         RECORD: record,
         VIEW: view_settings(picture),
-        CONFIG: _config(road, len(record)),
+        CONFIG: _config(file, len(record)),
     }
-    return {road.file: road.net} | {name: to_bytes(root) for name, root in roots.items()}
+    return {file: net} | {name: to_bytes(root) for name, root in roots.items()}
 
 
 def _types(trajectory: Trajectory) -> etree._Element:
@@ -299,10 +288,10 @@ def _box(points: Sequence[tuple[float, float]]) -> tuple[float, FloatArray]:
     return max(width_m, height_m / (0.8 * SHAPE)), (low + high) / 2.0
 
 
-def _config(road: ReplayRoad, timesteps: int) -> etree._Element:
+def _config(net_file: str, timesteps: int) -> etree._Element:
     end_s = timesteps * DT_S
     options = {
-        "net-file": road.file,
+        "net-file": net_file,
         "additional-files": f"{TYPES},{LABELS}",
         "begin": "0",
         "end": f"{end_s:.1f}",
