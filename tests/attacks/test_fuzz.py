@@ -7,10 +7,7 @@ bytes at all. A `UserError` is the only exception allowed.
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable
 from contextlib import suppress
-from pathlib import Path
-from typing import Any
 
 import pytest
 from hypothesis import HealthCheck, given, settings
@@ -34,7 +31,7 @@ HARSH = [
 
 
 @st.composite
-def spoilt(draw: Any, original: bytes) -> bytes:
+def spoilt(draw, original):
     """Return bytes of which a few parts are replaced, doubled or cut off; or any bytes."""
     if draw(st.integers(0, 9)) == 0:
         return bytes(draw(st.binary(max_size=200)))
@@ -46,12 +43,12 @@ def spoilt(draw: Any, original: bytes) -> bytes:
     return bytes(text)
 
 
-def read_settings(folder: Path) -> None:
+def read_settings(folder):
     run = RecordedCampaign(folder)
     settings_from_folder(run.folder, run.record)
 
 
-READERS: list[tuple[str, str, Callable[[Path], object]]] = [
+READERS = [
     ("run", SETTINGS, read_settings),
     ("run", SETTINGS, lambda folder: write_report(RecordedCampaign(folder))),
     ("run", OUTCOMES, lambda folder: write_report(RecordedCampaign(folder))),
@@ -65,7 +62,7 @@ READERS: list[tuple[str, str, Callable[[Path], object]]] = [
 
 
 @pytest.fixture(scope="module")
-def written(run: RecordedCampaign, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def written(run, tmp_path_factory):
     """Return a folder of files that merge-sumo wrote."""
     folder = tmp_path_factory.mktemp("written")
     shutil.copytree(run.folder, folder / "run")
@@ -83,9 +80,7 @@ def written(run: RecordedCampaign, tmp_path_factory: pytest.TempPathFactory) -> 
     suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
 )
 @given(data=st.data())
-def test_a_spoilt_file_is_a_value_or_a_sentence(
-    written: Path, folder: str, file: str, reader: Callable[[Path], object], data: Any
-) -> None:
+def test_a_spoilt_file_is_a_value_or_a_sentence(written, folder, file, reader, data):
     path = written / folder / file
     before = path.read_bytes()
     path.write_bytes(data.draw(spoilt(before)))

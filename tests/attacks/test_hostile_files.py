@@ -31,7 +31,7 @@ from merge_sumo.sumo import replay as replay_module
 from merge_sumo.sumo.binding import run_program
 from merge_sumo.sumo.opendrive import opendrive
 from merge_sumo.sumo.replay import replay
-from merge_sumo.sumo.replay_folder import CASE, CONFIG, HOSTED_NET, RECORD
+from merge_sumo.sumo.replay_folder import CONFIG, HOSTED_NET, RECORD
 from merge_sumo.sumo.sumo_simulation import SumoSimulation
 
 HONEST = Path(__file__).resolve().parents[2] / "scenarios" / "roundabout-yields"
@@ -93,12 +93,9 @@ def pipe(path: Path) -> None:
     os.mkfifo(path)
 
 
-def linked(target: str) -> Change:
-    def change(path: Path) -> None:
-        path.unlink()
-        path.symlink_to(target)
-
-    return change
+def link(path: Path) -> None:
+    path.unlink()
+    path.symlink_to("../home/secret.xml")
 
 
 def in_utf_16(path: Path) -> None:
@@ -147,8 +144,7 @@ ATTACKS = {
     "long name": (SETTINGS, instead("design1", "<script>" * 10**6), export, "at most 10,000"),
     "pipe of outcomes": (OUTCOMES, pipe, export, "it is not a file"),
     "terabyte": (HOSTED_NET, of_a_terabyte, play, "it is larger than"),
-    "link to a secret": (RECORD, linked("../home/secret.xml"), play, "must have"),
-    "link to zeroes": (CASE, linked("/dev/zero"), play, "it is not a file"),
+    "link to a secret": (RECORD, link, play, "must have"),
     # The cache of truths.
     "truth": (TRUTH, truth(), believe, "believed"),
     "pickle": (TRUTH, truth(points=np.full((30, 2), None)), believe, "not believed"),

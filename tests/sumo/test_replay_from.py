@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 from lxml import etree
@@ -25,20 +23,20 @@ STALEMATE = Path(__file__).parents[2] / "scenarios" / "roundabout-stalemate"
 
 
 @pytest.fixture
-def assert_continues(monkeypatch: pytest.MonkeyPatch) -> Callable[[Path, dict[float, float]], None]:
+def assert_continues(monkeypatch):
     """Return a function that replays a folder from times on, in s, by the times of the first rows.
 
     It checks that the rows that SUMO writes are the end of those of the whole replay.
     """
-    written: list[bytes] = []
+    written = []
 
-    def kept(name: str, arguments: Any, stage: Path, **options: Any) -> str:
+    def kept(name, arguments, stage, **options):
         reason = run_program(name, arguments, stage, **options)
         content = (stage / REPLAYED).read_bytes()
         written.append(content[content.index(b"    <timestep") :])
         return reason
 
-    def check(folder: Path, begins: dict[float, float]) -> None:
+    def check(folder, begins):
         assert replay(folder).identical
         whole = written[-1]
         for from_s, begin_s in begins.items():
@@ -54,9 +52,7 @@ def assert_continues(monkeypatch: pytest.MonkeyPatch) -> Callable[[Path, dict[fl
 
 
 @pytest.mark.parametrize("name", shipped_scenarios())
-def test_sumo_writes_the_same_bytes_from_there_on(
-    name: str, assert_continues: Any, tmp_path: Path
-) -> None:
+def test_sumo_writes_the_same_bytes_from_there_on(name, assert_continues, tmp_path):
     settings = campaign_settings(
         vut="design2", levels=(0, 1), cases=2, batch=2, seed=1, scenario=named_scenario(name)
     )
@@ -68,19 +64,16 @@ def test_sumo_writes_the_same_bytes_from_there_on(
         assert_continues(folder, {s: max(at_s + s, 0.0) for s in (-3.0, 0.0)})
 
 
-def test_also_where_vehicles_are_inside_of_junctions(assert_continues: Any) -> None:
+def test_also_where_vehicles_are_inside_of_junctions(assert_continues):
     before_s = [-0.1 * row for row in range(0, 116, 5)]
     assert_continues(STALEMATE, {s: max(11.5 + s, 0.0) for s in before_s})
     record = etree.parse(STALEMATE / RECORD).getroot()
-    inside = 0
-    for s in before_s:
-        for car in record[round((11.5 + s) * 10)]:
-            inside += str(car.get("lane")).startswith(":")
-    assert inside > 3
+    lanes = [car.get("lane", "") for s in before_s for car in record[round((11.5 + s) * 10)]]
+    assert sum(lane.startswith(":") for lane in lanes) > 3
 
 
 class TestTheCommand:
-    def test_prints_the_begin_and_its_reason(self, command_line: Any) -> None:
+    def test_prints_the_begin_and_its_reason(self, command_line):
         code, out, _ = command_line("replay", STALEMATE, "--from", "-3")
         _, _, begins, verdict = out.splitlines()
         assert (code, begins) == (0, "from 8.5 s, 3 s before the contact at 11.5 s")
@@ -89,5 +82,5 @@ class TestTheCommand:
 
     @pytest.mark.parametrize("number", ["3", "nan", "-inf"])
     @pytest.mark.parametrize("command", [("replay", STALEMATE), ("run",)])
-    def test_refuses_another_number(self, command: Any, number: str, command_line: Any) -> None:
+    def test_refuses_another_number(self, command, number, command_line):
         assert_refused(command_line(*command, "--from", number), "--from", "not above 0, such as")

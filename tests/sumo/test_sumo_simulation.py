@@ -10,20 +10,12 @@ from support.plans import POVS
 
 from merge_sumo.drivers.level0 import Level0Vut
 from merge_sumo.metrics.measures import Measures
-from merge_sumo.scenario.case import Case, from_unit
+from merge_sumo.scenario.case import from_unit
 from merge_sumo.scenario.scenario import US23
 from merge_sumo.scenario.trajectory import End
 from merge_sumo.simulation.povs import PovLibrary
 from merge_sumo.simulation.rollout import Rollout
 from merge_sumo.sumo.sumo_simulation import SimulationError, SumoSimulation
-
-
-def random_cases(count: int, seed: int = 0) -> list[Case]:
-    return from_unit(np.random.default_rng(seed).random((count, 2)), level=0, scenario=US23)
-
-
-def run_all(simulation, pov, vut, cases):
-    return Rollout(simulation, pov, vut, cases).run()
 
 
 @pytest.mark.parametrize("speed_mps", [29.0, 31.0])
@@ -42,7 +34,7 @@ def test_a_speed_that_is_not_what_sumo_was_told_shows_in_the_next_step(speed_mps
 def test_when_sumo_fails_the_running_cases_are_sim_errors_and_the_others_go_on(
     monkeypatch, half_step
 ):
-    cases = random_cases(30)
+    cases = from_unit(np.random.default_rng(0).random((30, 2)), level=0, scenario=US23)
     with SumoSimulation(4, scenario=US23) as simulation:
         call, calls = getattr(simulation, half_step), iter(range(10_000))
 
@@ -52,7 +44,7 @@ def test_when_sumo_fails_the_running_cases_are_sim_errors_and_the_others_go_on(
             call(*arguments)
 
         monkeypatch.setattr(simulation, half_step, failing)
-        trajectories = run_all(simulation, PovLibrary(4, POVS), Level0Vut(4), cases)
+        trajectories = Rollout(simulation, PovLibrary(4, POVS), Level0Vut(4), cases).run()
     broken = [t for t in trajectories if t.end is End.SIM_ERROR]
     assert len(broken) == 4
     assert all("the simulation broke" in t.error for t in broken)
