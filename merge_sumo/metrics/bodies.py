@@ -64,7 +64,7 @@ def closest_before_m(trajectories: Sequence[Trajectory], lines: CentreLines) -> 
     Episodes are computed together, because most of the time of one is the calls of numpy.
 
     Args:
-        trajectories: the motions.
+        trajectories: the motions, of one scenario.
         lines: centre lines of the road.
 
     Returns:
@@ -76,24 +76,20 @@ def closest_before_m(trajectories: Sequence[Trajectory], lines: CentreLines) -> 
         x_vut_m = trajectory.motion[:, VUT, 0]
         steps = np.flatnonzero((x_vut_m > -lines.together_m) & (x_vut_m < 0.0))
         if steps.size:
-            # One row for each step and car: x of the car, x of the VUT, and both lengths.
-            cars = np.delete(trajectory.motion[steps, :, 0], VUT, axis=1)[..., None]
-            own = np.broadcast_to(trajectory.motion[steps, VUT, None, :1], cars.shape)
-            lengths = trajectory.case.scenario.lengths_m
-            rows = np.concatenate(
-                (cars, own, np.broadcast_to(lengths, (*cars.shape[:2], 2))), axis=2
-            )
-            parts.append(rows.reshape(-1, 4))
+            # One row for each step and car: x of the car and of the VUT.
+            cars = np.delete(trajectory.motion[steps, :, 0], VUT, axis=1)
+            own = np.broadcast_to(x_vut_m[steps, None], cars.shape)
+            parts.append(np.stack((cars.ravel(), own.ravel()), axis=1))
             places.append(place)
     if not parts:
         return closest_m
-    x_car, x_vut, car_length, vut_length = np.concatenate(parts).T
-    vut = _Bodies(lines.ramp, x_vut, vut_length)
-    apart_m = _separation_m(vut, _Bodies(lines.mainline, x_car, car_length))
+    x_car_m, x_vut_m = np.concatenate(parts).T
+    car_length_m, vut_length_m = trajectories[0].case.scenario.lengths_m
+    vut = _Bodies(lines.ramp, x_vut_m, vut_length_m)
+    apart_m = _separation_m(vut, _Bodies(lines.mainline, x_car_m, car_length_m))
     firsts = np.cumsum([0, *(len(part) for part in parts[:-1])])
-    for place, clearance_m in zip(
-        places, np.minimum.reduceat(apart_m, firsts).tolist(), strict=True
-    ):
+    smallest_m = np.minimum.reduceat(apart_m, firsts).tolist()
+    for place, clearance_m in zip(places, smallest_m, strict=True):
         closest_m[place] = clearance_m
     return closest_m
 
@@ -106,12 +102,12 @@ def _at(line: FloatArray, along_m: FloatArray) -> FloatArray:
 class _Bodies:
     """A body at n moments: its centre and heading, (n, 2), and half its length and width."""
 
-    def __init__(self, line: FloatArray, front_m: FloatArray, length_m: FloatArray) -> None:
+    def __init__(self, line: FloatArray, front_m: FloatArray, length_m: float) -> None:
         front, rear = _at(line, front_m), _at(line, front_m - length_m)
         chord = front - rear
         self.heading = chord / np.maximum(np.linalg.norm(chord, axis=1), 1e-9)[:, None]
         self.aside = np.column_stack([-self.heading[:, 1], self.heading[:, 0]])
-        self.centre = front - 0.5 * length_m[:, None] * self.heading
+        self.centre = front - 0.5 * length_m * self.heading
         self._half_length_m = 0.5 * length_m
 
     def reach_m(self, axis: FloatArray) -> FloatArray:

@@ -12,8 +12,8 @@ from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.scenario.case import Case, FloatArray, coordinates
 from merge_sumo.scenario.scenario import POV, VEHICLES, VUT, Scenario
 
-DECIMALS = {"m": 0, "m/s": 1, "s": 2, "rad": 2}
-"""Decimals of the bounds of boxes, by unit."""
+DECIMALS = {"m": 0, "m/s": 1}
+"""Decimals of the bounds of boxes by unit; 2 in other units."""
 MOST_BOXES = 10
 """Leaves of the decision tree of a level."""
 FEWEST_FAILURES = 3
@@ -57,8 +57,7 @@ def _quantities(cases: Sequence[Case], scenario: Scenario) -> dict[tuple[str, st
                 due_s.append(-x_m / v_mps if v_mps > 0.0 else scenario.timeout_s)
             name = "POV" if row == POV else f"car {VEHICLES[row]}"
             values[f"{name} due at M (at constant speed)", "s"] = due_s
-    x, v, *others = coordinates(scenario, (cases[0].level,))
-    for coordinate in (v, x, *others):
+    for coordinate in coordinates(scenario, (cases[0].level,)):
         own = [coordinate.of(case) or 0.0 for case in cases]
         values[coordinate.name, coordinate.unit] = own
     return values
@@ -69,7 +68,7 @@ def failure_boxes(outcomes: Sequence[Outcome], level: int) -> list[FailureBox]:
 
     A small decision tree (scikit-learn, Gini, balanced classes) separates failing from other
     cases. Its leaves in which at least half of the cases fail are the boxes; failing siblings are
-    one box. The shares are of cases that a sampler chose: they are no probabilities.
+    one box. The shares are of cases that a sampler chose: they are not probabilities.
 
     Args:
         outcomes: outcomes of a campaign, one a case.

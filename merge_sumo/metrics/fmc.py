@@ -273,9 +273,8 @@ def _checked(points: ArrayLike) -> FloatArray:
         return np.zeros((0, 1))
     if cases.ndim != 2 or not 1 <= cases.shape[1] <= 6:
         raise ValueError(f"points must have shape (n, d) with d from 1 to 6, got {cases.shape}")
-    bad = np.flatnonzero(~np.isfinite(cases).all(axis=1))
-    if len(bad):
-        raise ValueError(f"points must be finite, but point {bad[0]} is {cases[bad[0]].tolist()}")
+    if not np.isfinite(cases).all():
+        raise ValueError("points must be finite")
     return cases
 
 

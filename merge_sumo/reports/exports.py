@@ -12,7 +12,7 @@ from typing import Any
 from merge_sumo.campaigns.campaign import SCENARIOS, case_name, export_case
 from merge_sumo.campaigns.recorded import RecordedCampaign
 from merge_sumo.errors import UserError
-from merge_sumo.files import check_own, make_folder, new_file, write_folder
+from merge_sumo.files import check_own, make_folder, write_folder, write_new
 from merge_sumo.metrics.bodies import WIDTH_M
 from merge_sumo.metrics.merge import merged_rows
 from merge_sumo.reports.cases_toml import new_file_in, write_cases
@@ -103,13 +103,11 @@ def write_table(run: RecordedCampaign, indices: Sequence[int], target: Path) -> 
         rows += _rows(run, index)
     path = new_file_in(target, TABLE)
     signals = dict.fromkeys(name for row in rows for name in row if name.startswith(SIGNAL))
-    with new_file(path) as file:
-        text = io.TextIOWrapper(file, encoding="utf-8", newline="")
-        writer = csv.DictWriter(text, (*columns_of(run.scenario), *signals))
-        writer.writeheader()
-        writer.writerows(rows)
-        text.flush()
-        text.detach()
+    table = io.StringIO(newline="")
+    writer = csv.DictWriter(table, (*columns_of(run.scenario), *signals))
+    writer.writeheader()
+    writer.writerows(rows)
+    write_new(path, table.getvalue().encode())
     return path
 
 

@@ -158,14 +158,12 @@ def _search(model: ReportModel) -> dict[str, Any]:
     outcomes = len(model.run.outcomes)
     steps = [outcomes * step // 20 for step in range(21)]
     levels = []
+    failed = sorted(model.worst, key=lambda outcome: outcome.index)
     for level in model.levels:
-        cases, indices = [], []
-        for outcome in sorted(model.worst, key=lambda outcome: outcome.index):
-            if outcome.case.level == level:
-                cases.append(outcome.case)
-                indices.append(outcome.index)
-        growth = np.concatenate([[0.0], fmc_growth(to_unit(cases, level, model.run.scenario))])
-        found = np.searchsorted(indices, steps)
+        at_level = [outcome for outcome in failed if outcome.case.level == level]
+        points = to_unit((one.case for one in at_level), level, model.run.scenario)
+        growth = np.concatenate([[0.0], fmc_growth(points)])
+        found = np.searchsorted([one.index for one in at_level], steps)
         levels.append({"level": level, "fmc": growth[found].round(5).tolist()})
     return {"cases": steps, "levels": levels}
 

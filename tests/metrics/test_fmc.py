@@ -115,7 +115,7 @@ def test_order_and_repetition_do_not_matter(points, random):
     [
         ([0.1, 0.2], r"points must have shape \(n, d\) with d from 1 to 6, got \(2,\)"),
         (np.zeros((0, 7)), r"points must have shape .* got \(0, 7\)"),
-        ([[0.1, 0.2], [0.3, math.nan]], r"points must be finite, but point 1 is \[0.3, nan\]"),
+        ([[0.1, 0.2], [0.3, math.nan]], "points must be finite"),
     ],
 )
 def test_bad_points_are_refused(points, sentence):

@@ -70,7 +70,6 @@ def test_on_a_terminal_bars_end_with_what_was_found(run, tmp_path, clock):
     ("count", "elapsed_s", "text"),
     [
         (7140, 1.0, "7,140 cases/s"),
-        (5, 2.0, "2.5 cases/s"),
         (1, 20.0, "3.0 cases/min"),
         (0, 5.0, "- cases/s"),
     ],
