@@ -27,7 +27,7 @@ from merge_sumo.metrics.regression import regression
 from merge_sumo.samplers.base import Sampler
 from merge_sumo.samplers.controller_model import ControllerModelPair
 from merge_sumo.scenario.case import Case, FloatArray
-from merge_sumo.simulation.evaluate import lost, simulate_part, with_measures
+from merge_sumo.simulation.evaluate import lost_episode, simulate_part, with_measures
 from merge_sumo.simulation.plan import SimulationPlan
 from merge_sumo.workers import MAX_CHUNK, Job, Workers
 
@@ -88,7 +88,7 @@ class SearchLoop:
         """
         self._sampler, self._until, self._stop = sampler, cases, stop
         self._simulate = partial(simulate_part, plan, keep=with_measures)
-        self._lost = partial(lost, plan)
+        self._lost = partial(lost_episode, plan)
         self._workers = Workers() if workers is None else workers
         self._batch_size, self._draws, self._in_flight = batch, draws, in_flight
         self._ahead = not sampler.learns and stop is None

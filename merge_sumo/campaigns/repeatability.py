@@ -26,7 +26,7 @@ from merge_sumo.printable import counted
 from merge_sumo.records import Record, read_indexed, to_json
 from merge_sumo.scenario.scenario import DT_S, OWN, VEHICLES, EpisodeTime, Vehicle
 from merge_sumo.scenario.trajectory import End, Trajectory
-from merge_sumo.simulation.evaluate import lost, simulate_part, with_measures
+from merge_sumo.simulation.evaluate import lost_episode, simulate_part, with_measures
 from merge_sumo.simulation.plan import SimulationPlan
 from merge_sumo.workers import Workers
 
@@ -84,7 +84,7 @@ def check_repeatability(
     second_runs = []
     cases = [outcome.case for outcome in outcomes]
     job = workers.submit(
-        partial(simulate_part, plan, keep=with_measures), cases, partial(lost, plan)
+        partial(simulate_part, plan, keep=with_measures), cases, partial(lost_episode, plan)
     )
     for outcome, episode in zip(outcomes, workers.collect(job), strict=True):
         if not episode.outcome.measures.end.is_error:  # of a slow machine, perhaps

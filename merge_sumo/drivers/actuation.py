@@ -14,7 +14,11 @@ ROUNDING_MPS2 = 1e-9
 
 
 def whole_steps(time_s: float) -> tuple[int, float]:
-    """Return the whole steps of a time, and the rest as a share of a step."""
+    """Return the whole steps of a time, and the rest as a share of a step.
+
+    Args:
+        time_s: a time.
+    """
     steps = round(time_s / DT_S, 9)
     return int(steps), steps % 1.0
 
@@ -69,18 +73,31 @@ class ActuatedDriver(DriverWrapper):
     """
 
     def __init__(self, driver: Driver) -> None:
-        """Take the driver."""
+        """Wrap a driver.
+
+        Args:
+            driver: gives the commands.
+        """
         super().__init__(driver)
         self._actuators: dict[int, _Actuator] = {}
         self._clipped = np.zeros(driver.corridors, dtype=np.bool_)
 
     def begin(self, corridor: int, case: Case) -> None:
-        """Take the actuator of a case."""
+        """Take the actuator of a case.
+
+        Args:
+            corridor: index of the corridor.
+            case: the case of the next episode.
+        """
         self._actuators[corridor] = _Actuator(case)
         super().begin(corridor, case)
 
     def act(self, scene: Scene) -> FloatArray:
-        """Return the accelerations of the vehicle, (K,); NaN and infinity pass at once."""
+        """Return the accelerations of the vehicle, (K,); NaN and infinity pass at once.
+
+        Args:
+            scene: the present state.
+        """
         answers = np.array(self._driver.act(scene))
         self._clipped[:] = False
         for corridor in np.flatnonzero(scene.active & np.isfinite(answers)).tolist():

@@ -36,14 +36,23 @@ class PovAfterMerge(DriverWrapper):
         """Speeds of the VUTs a step ago."""
 
     def begin(self, corridor: int, case: Case) -> None:
-        """Take the first speed of a car."""
+        """Take the first speed of a car.
+
+        Args:
+            corridor: index of the corridor of the car.
+            case: the case of the next episode.
+        """
         super().begin(corridor, case)
         self._v_first_mps[corridor] = case.v_pov0_mps
         self._is_own[corridor] = case.level == OWN
         self._v_vut_mps[corridor] = case.starts()[VUT][1]
 
     def act(self, scene: Scene) -> FloatArray:
-        """Return the accelerations, (K,)."""
+        """Return the accelerations of the cars, (K,).
+
+        Args:
+            scene: the present state of the corridors of all cars.
+        """
         merged = np.zeros(self.corridors, np.bool_) if scene.merged is None else scene.merged
         x_pov, v_pov, x_vut, v_vut = scene.x_pov_m, scene.v_pov_mps, scene.x_vut_m, scene.v_vut_mps
         after_m = ~merged & ~self._is_own & (x_vut >= 0.0)

@@ -1,4 +1,4 @@
-"""Drivers: their scenes and their accelerations."""
+"""What a driver sees and answers: the scene of a step, and the interface of all drivers."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from merge_sumo.scenario.signals import StepSignals
 
 
 class Scene(NamedTuple):
-    """The state of K corridors with A vehicles each at one step, as read from SUMO.
+    """The state of K corridors with A vehicles each at one step.
 
     Attributes:
         active: whether an episode runs in the corridor, (K,); elsewhere the numbers are undefined.
@@ -30,6 +30,10 @@ class Scene(NamedTuple):
             the POV itself everywhere.
         merged: whether the VUT is on the mainline, from M on or since its merge from an
             acceleration lane, (K,); None where episodes end at M.
+
+    Example:
+        scene = Scene(np.array([True]), np.array([0]), x_m, v_mps)
+        gap_m = scene.dx_at_m(scene.distance_m / scene.v_vut_mps)
     """
 
     active: NDArray[np.bool_]
@@ -46,7 +50,7 @@ class Scene(NamedTuple):
 
     @property
     def v_pov_mps(self) -> FloatArray:
-        """Speeds of the same, (K,)."""
+        """Speeds of the POV, (K,), or of the car that counts as POV."""
         return self._of_conflicting(self.v_mps)
 
     @property
@@ -80,8 +84,8 @@ class Scene(NamedTuple):
     def of_mainline(self) -> Scene:
         """Return the scene for the driver of all C cars of the mainline.
 
-        Each car is the POV of a corridor of its own. So there are C K corridors: those of the POVs,
-        then those of the cars ahead, then those of the cars behind.
+        Each car is the POV of its own corridor. So there are C K corridors: those of the POVs, then
+        those of the cars ahead, then those of the cars behind.
         """
         cars = len(self.x_m) - 1
         if cars == 1:
@@ -124,11 +128,20 @@ class Driver(ABC):
     _merge_requests: NDArray[np.int8] | None = None
 
     def __init__(self, corridors: int) -> None:
-        """Prepare for corridors 0 to `corridors` - 1."""
+        """Prepare for corridors 0 to `corridors` - 1.
+
+        Args:
+            corridors: number of corridors, K.
+        """
         self.corridors = corridors
 
     def begin(self, corridor: int, case: Case) -> None:
-        """Forget everything about a corridor: a new episode begins there."""
+        """Forget everything about a corridor: a new episode begins there.
+
+        Args:
+            corridor: index of the corridor.
+            case: the case of the episode.
+        """
         self.scenario = case.scenario
 
     @abstractmethod
@@ -137,12 +150,19 @@ class Driver(ABC):
 
         A value that is not finite ends the episode of its corridor as an error.
 
+        Args:
+            scene: the present state.
+
         Raises:
-            VutLostError: if the episodes of all corridors have to begin again.
+            ControllerDiedError: if the episodes of all corridors have to begin again.
         """
 
     def reason(self, corridor: int) -> str | None:
-        """Return the reason why the last answer for a corridor was not finite, if it is known."""
+        """Return the reason why the last answer for a corridor was not finite; None if unknown.
+
+        Args:
+            corridor: index of the corridor.
+        """
         return None
 
     def merge_requests(self) -> NDArray[np.int8] | None:
@@ -169,7 +189,11 @@ class Driver(ABC):
         return {}
 
     def in_vain(self, corridor: int) -> Collection[str]:
-        """Return the commands of this episode that were accepted but changed nothing."""
+        """Return the commands of this episode that were accepted but changed nothing.
+
+        Args:
+            corridor: index of the corridor.
+        """
         return ()
 
     def files(self) -> tuple[Path, ...]:
@@ -199,6 +223,9 @@ class Design:
 class BuiltInVut:
     """A VUT of this package: a value of `VUTS` in a file of this folder, by its name.
 
+    Example:
+        VUTS = {"careful": BuiltInVut(CarefulVut)}
+
     Attributes:
         make: makes its driver for a number of corridors, with its design if it has one, or with a
             folder of networks if it is learned.
@@ -217,16 +244,30 @@ class DriverWrapper(Driver):
     """Drives by another driver: a base for drivers that change its input or its output."""
 
     def __init__(self, driver: Driver) -> None:
+        """Wrap a driver.
+
+        Args:
+            driver: the driver.
+        """
         super().__init__(driver.corridors)
         self._driver = driver
 
     def begin(self, corridor: int, case: Case) -> None:
-        """Begin an episode for the driver."""
+        """Begin an episode for the driver.
+
+        Args:
+            corridor: index of the corridor.
+            case: the case of the episode.
+        """
         super().begin(corridor, case)
         self._driver.begin(corridor, case)
 
     def reason(self, corridor: int) -> str | None:
-        """Return the reason of the driver."""
+        """Return the reason of the driver.
+
+        Args:
+            corridor: index of the corridor.
+        """
         return self._driver.reason(corridor)
 
     def merge_requests(self) -> NDArray[np.int8] | None:
@@ -242,7 +283,11 @@ class DriverWrapper(Driver):
         return self._driver.signals()
 
     def in_vain(self, corridor: int) -> Collection[str]:
-        """Return the commands of the driver that changed nothing."""
+        """Return the commands of the driver that changed nothing.
+
+        Args:
+            corridor: index of the corridor.
+        """
         return self._driver.in_vain(corridor)
 
     def files(self) -> tuple[Path, ...]:

@@ -26,7 +26,7 @@ LEADERS = slice(AHEAD, None, POV - AHEAD)
 def safe_speed_mps(
     gap_m: FloatArray, v_leader_mps: FloatArray, decel_mps2: float, tau_s: float
 ) -> FloatArray:
-    """Return the safe speed of Krauss behind a leader, SUMO's original car-following model.
+    """Compute the safe speed of Krauss behind a leader, SUMO's original car-following model.
 
     At this speed a car can still stop behind a leader that brakes as hard as it can:
     v_safe = -b tau + sqrt((b tau)^2 + v_leader^2 + 2 b gap). S. Krauss, "Microscopic modeling of
@@ -37,6 +37,9 @@ def safe_speed_mps(
         v_leader_mps: speeds of the leaders, of the same shape.
         decel_mps2: hardest braking b, positive.
         tau_s: reaction time tau.
+
+    Returns:
+        The speeds in m/s, of the same shape.
     """
     lag = decel_mps2 * tau_s
     room = 2.0 * decel_mps2 * np.maximum(gap_m, 0.0)
@@ -60,7 +63,7 @@ def keep_safe(a_mps2: FloatArray, x_m: FloatArray, v_mps: FloatArray, scenario: 
 
 
 def conflicting_car(x_m: FloatArray, v_mps: FloatArray, scenario: Scenario) -> NDArray[np.int64]:
-    """Return the row of the conflicting car, (K,).
+    """Find the conflicting car in each corridor.
 
     It is nearest to M when the VUT is there, if all cars keep their speeds and the VUT follows the
     level-0 profile. Of two equally near cars it is the one with the lower row.
@@ -69,6 +72,9 @@ def conflicting_car(x_m: FloatArray, v_mps: FloatArray, scenario: Scenario) -> N
         x_m: positions of all vehicles, (A, K).
         v_mps: their speeds, (A, K).
         scenario: the scenario of the profile.
+
+    Returns:
+        The rows of the cars, (K,).
     """
     distance_m = np.maximum(-x_m[VUT], 0.0)
     gaps_m = np.abs(x_m + v_mps * level0_time_to(distance_m, v_mps[VUT], scenario))

@@ -1,4 +1,4 @@
-"""A rule-based VUT for entries where it gives way: it takes a gap, or waits for one at a line."""
+"""A rule-based VUT for roundabouts: it takes a gap, or waits for one at the yield line."""
 
 from __future__ import annotations
 
@@ -30,30 +30,47 @@ class GapDesign(Design):
 
 
 ROUNDABOUT = GapDesign(line_m=7.0, lead_s=1.8, lag_s=2.0, brake_mps2=1.5)
-"""Waits 4 m past the yield line. `policies/roundabout/README.md` has the reasons."""
+"""The line is 4 m past the yield line. `policies/roundabout/README.md` has the reasons."""
 
 
 class GapAcceptanceVut(Level0Vut):
-    """Waits for a gap, then takes it by the level-0 profile without checking it again.
+    """A VUT that waits for a gap, then takes it by the level-0 profile without a second check.
 
     There is a gap where the VUT and the POV are not due at M at about the same time, if the POV
     keeps its speed and the VUT follows the profile. Without a gap the VUT keeps its speed and
     brakes to stop at the line. Where it cannot stop there, it goes.
+
+    Attributes:
+        design: the parameters.
     """
 
     def __init__(self, corridors: int, design: GapDesign = ROUNDABOUT) -> None:
-        """Prepare a controller of this design for each corridor."""
+        """Begin without a gap in all corridors.
+
+        Args:
+            corridors: number of corridors, K.
+            design: the parameters.
+        """
         super().__init__(corridors)
         self.design = design
         self._goes = np.zeros(corridors, dtype=bool)
 
     def begin(self, corridor: int, case: Case) -> None:
-        """Look for a gap again."""
+        """Look for a gap again.
+
+        Args:
+            corridor: index of the corridor.
+            case: the case of the next episode.
+        """
         super().begin(corridor, case)
         self._goes[corridor] = False
 
     def act(self, scene: Scene) -> FloatArray:
-        """Return the level-0 acceleration where it goes, else the braking to stop at the line."""
+        """Return the level-0 acceleration where it goes, else braking to the line, (K,).
+
+        Args:
+            scene: the present state.
+        """
         design, v = self.design, scene.v_vut_mps
         distance_m = scene.distance_m
         due_s = level0_time_to(distance_m, v, self.scenario)

@@ -1,4 +1,4 @@
-"""A rule-based VUT for acceleration lanes: it merges into the first gap that is long enough."""
+"""A rule-based VUT for acceleration lanes, which merges into the first gap that is long enough."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ HEADWAY = GapChoice()
 
 
 class GapChoiceVut(Level0Vut):
-    """Drives the level-0 profile along the acceleration lane, and merges into the first gap.
+    """A VUT that drives the level-0 profile along the lane and merges into the first gap.
 
     A time gap is the distance from bumper to bumper, over the speed of the following car. The VUT
     requests a merge where, in the next step by eq. (4), the time gaps to the car ahead of it and to
@@ -59,13 +59,22 @@ class GapChoiceVut(Level0Vut):
         """Speeds of all vehicles a step ago, (A, K)."""
 
     def begin(self, corridor: int, case: Case) -> None:
-        """Take the speeds at the start of the case."""
+        """Take the speeds at the start of a case.
+
+        Args:
+            corridor: index of the corridor.
+            case: the case of the next episode.
+        """
         super().begin(corridor, case)
         if self._before_mps is not None:
             self._before_mps[:, corridor] = [v_mps for _, v_mps in case.starts()]
 
     def act(self, scene: Scene) -> FloatArray:
-        """Return the acceleration in each corridor, (K,), and make the merge requests."""
+        """Return the acceleration in each corridor, (K,), and make the merge requests.
+
+        Args:
+            scene: the present state.
+        """
         answer = super().act(scene)
         if self.scenario.lane_m is None or scene.merged is None:
             self._merge_requests = np.full(self.corridors, NO_REQUEST, dtype=np.int8)

@@ -10,13 +10,18 @@ from merge_sumo.scenario.scenario import DT_S, Scenario
 
 
 def level0_acceleration(v_vut_mps: FloatArray, scenario: Scenario) -> FloatArray:
-    """Return the acceleration of the level-0 VUT, m/s2: constant until exactly its speed."""
+    """Return the accelerations of the level-0 profile, constant until exactly its speed.
+
+    Args:
+        v_vut_mps: present speeds, of any shape.
+        scenario: the scenario of the profile.
+    """
     missing = np.maximum((scenario.level0_v_mps - v_vut_mps) / DT_S, 0.0)
     return np.minimum(missing, scenario.level0_a_mps2)
 
 
 def level0_time_to(distance_m: FloatArray, v_vut_mps: FloatArray, scenario: Scenario) -> FloatArray:
-    """Return the seconds that a vehicle needs for a distance on the level-0 profile.
+    """Compute the time that a vehicle needs for a distance on the level-0 profile.
 
     The profile accelerates by `level0_a_mps2` to `level0_v_mps`, then keeps the speed; a faster
     vehicle keeps its own. The steps of eq. (4) lie on the parabola that begins slower by half the
@@ -26,6 +31,9 @@ def level0_time_to(distance_m: FloatArray, v_vut_mps: FloatArray, scenario: Scen
         distance_m: distances, not negative, of any shape.
         v_vut_mps: present speeds, of the same shape.
         scenario: the scenario of the profile.
+
+    Returns:
+        The times in s, of the same shape.
     """
     a_mps2 = scenario.level0_a_mps2
     lag, twice_a = (0.5 * DT_S) * a_mps2, 2.0 * a_mps2
@@ -38,18 +46,31 @@ def level0_time_to(distance_m: FloatArray, v_vut_mps: FloatArray, scenario: Scen
 
 
 class Level0Pov(Driver):
-    """Keeps its speed."""
+    """A POV that keeps its speed."""
 
     def act(self, scene: Scene) -> FloatArray:
-        """Return no acceleration, (K,)."""
+        """Return accelerations of 0, (K,).
+
+        Args:
+            scene: the present state.
+        """
         return np.zeros(self.corridors)
 
 
 class Level0Vut(Driver):
-    """Accelerates by the scenario's level-0 profile and holds its speed: 1 m/s2 to 28 m/s."""
+    """A VUT that drives the level-0 profile of its scenario: in us23 by 1 m/s2 up to 28 m/s.
+
+    Example:
+        driver = Level0Vut(corridors=1)
+        a_mps2 = driver.act(scene)
+    """
 
     def act(self, scene: Scene) -> FloatArray:
-        """Return the level-0 acceleration, (K,)."""
+        """Return the accelerations of the level-0 profile, (K,).
+
+        Args:
+            scene: the present state.
+        """
         return level0_acceleration(scene.v_vut_mps, self.scenario)
 
 

@@ -22,9 +22,9 @@ from merge_sumo.scenario.case import Case, FloatArray
 from merge_sumo.scenario.scenario import US23, Scenario, Units
 
 BRAKING = (1.0, 0.75, 0.5, 0.25)
-"""Shares of the hardest braking that a learned driver chooses from,"""
+"""Shares of the hardest braking that a learned driver chooses from; it may also coast."""
 ACCELERATING = (0.5, 1.0)
-"""and of the hardest acceleration; between them it coasts."""
+"""Shares of the hardest acceleration that it chooses from."""
 ACTIONS = len(BRAKING) + 1 + len(ACCELERATING)
 DECISION_STEPS = 5
 """A learned driver decides every 0.5 s and holds its acceleration in between."""
@@ -37,8 +37,6 @@ SVO_FEATURES = 2
 LEVEL0_GAP_FEATURE = 8
 """Column with the gap at M if the POV keeps its speed and the VUT the level-0 profile, as
 tanh(gap / 25 m)."""
-MANY_ROWS = 40
-"""Rows from which products of whole matrices are quicker than one after the other."""
 SINGLE_ERROR = 1e-3
 """Lead of the best action, as a share of 1 + max |Q|, that float32 cannot reverse. The largest
 error in 200,000 states for each of the eight shipped networks is 1e-5."""
@@ -64,9 +62,13 @@ def actions_mps2(scenario: AccelerationLimits) -> FloatArray:
     """Return the accelerations of the actions of a learned driver, (7,), in rising order.
 
     In the paper's scenario they are the whole numbers from -4 to +2 m/s2.
+
+    Args:
+        scenario: gives the hardest braking and acceleration.
     """
-    hardest = [share * scenario.a_min_mps2 for share in BRAKING]
-    return np.array([*hardest, 0.0, *(share * scenario.a_max_mps2 for share in ACCELERATING)])
+    braking = np.array(BRAKING) * scenario.a_min_mps2
+    accelerating = np.array(ACCELERATING) * scenario.a_max_mps2
+    return np.concatenate([braking, [0.0], accelerating])
 
 
 def features(
@@ -75,7 +77,7 @@ def features(
     *,
     scenario: Scenario,
 ) -> FloatArray:
-    """Return the inputs of a network for n states, (n, 26), or (n, 28) with an orientation.
+    """Compute the inputs of a network.
 
     All are functions of the state [x_POV, v_POV, x_VUT, v_VUT] and psi alone: the state itself,
     scaled; the time of the VUT to M on the level-0 profile, at constant speed and at full
@@ -88,8 +90,11 @@ def features(
 
     Args:
         state: x_POV and v_POV, x_VUT and v_VUT, (n,) each, in m and m/s.
-        svo_rad: social value orientations of the POV, (n,), if the network sees them.
+        svo_rad: social value orientations psi of the POV, (n,); None for a network without them.
         scenario: the scenario that is played.
+
+    Returns:
+        The inputs, (n, 26), or (n, 28) with psi.
     """
     unit = Units.of(scenario)
     x_pov_m, v_pov_mps, x_vut_m, v_vut_mps = state
@@ -124,7 +129,7 @@ def svo_features(svo_rad: FloatArray) -> list[FloatArray]:
 def prospects(
     state: Sequence[FloatArray] | FloatArray, scenario: Scenario
 ) -> tuple[tuple[FloatArray, ...], tuple[FloatArray, ...], FloatArray, FloatArray]:
-    """Predict times, gaps and speeds at M for n states, every array of shape (n,).
+    """Predict times, gaps and speeds at M; every array has the shape (n,).
 
     Args:
         state: x_POV and v_POV, x_VUT and v_VUT, (n,) each, in m and m/s.
@@ -174,21 +179,26 @@ class QNetwork:
         layers: Sequence[tuple[FloatArray, FloatArray]],
         a_min_mps2: float | None = None,
     ) -> None:
-        """Take the layers, as float64, and the limit of braking."""
+        """Keep the layers in float64 and in float32.
+
+        Args:
+            layers: pairs of weights, (outputs, inputs), and biases, (outputs,).
+            a_min_mps2: hardest braking that its driver chooses; None for that of the scenario.
+        """
         self.a_min_mps2 = a_min_mps2
         self.layers = []
         self._single = []
         for weight, bias in layers:
             double = np.ascontiguousarray(weight, dtype=np.float64), bias.astype(np.float64)
             self.layers.append(double)
-            with np.errstate(over="ignore"):
-                self._single.append((weight.T.astype(np.float32), bias.astype(np.float32)))
+            self._single.append((weight.T.astype(np.float32), bias.astype(np.float32)))
 
     @classmethod
     def from_tensors(cls, tensors: Mapping[str, FloatArray]) -> QNetwork:
-        """Return the network whose tensors are named 0.weight, 0.bias, 1.weight, ...
+        """Return the network of tensors, after a check of their names, shapes and values.
 
-        The limit of braking, if the network has one, is a tensor of one number.
+        Args:
+            tensors: 0.weight, 0.bias, 1.weight, ..., and the limit of braking, (1,), if it has one.
 
         Raises:
             ValueError: for other names, shapes or types, some of which numpy would broadcast.
@@ -221,7 +231,10 @@ class QNetwork:
     def limited(self, scenario: Scenario) -> Scenario:
         """Return the scenario with the limit of braking of the network, if it brakes less hard.
 
-        Its observations and its actions are those of this scenario.
+        The observations and the actions of the network are those of this scenario.
+
+        Args:
+            scenario: the scenario that is played.
         """
         if self.a_min_mps2 is None or self.a_min_mps2 <= scenario.a_min_mps2:
             return scenario
@@ -232,11 +245,33 @@ class QNetwork:
         """Whether the network's input has the social value orientation."""
         return bool(self.layers[0][0].shape[1] == FEATURES + SVO_FEATURES)
 
+    def observe(
+        self, state: Sequence[FloatArray] | FloatArray, svo_rad: FloatArray, scenario: Scenario
+    ) -> FloatArray:
+        """Compute the inputs of this network.
+
+        Args:
+            state: x_POV and v_POV, x_VUT and v_VUT, (n,) each, in m and m/s.
+            svo_rad: social value orientations of the POV, (n,), which not every network sees.
+            scenario: the scenario that is played.
+
+        Returns:
+            The inputs, (n, 26) or (n, 28).
+        """
+        psi = svo_rad if self.sees_svo else None
+        return features(state, psi, scenario=self.limited(scenario))
+
     def values(self, inputs: FloatArray) -> FloatArray:
-        """Return Q, (n, actions), of inputs, (n, features).
+        """Compute Q of every action.
 
         Every row is a matrix-vector product of its own, so that it is the same to the last bit with
         any other rows. Q is not finite where the products are too large.
+
+        Args:
+            inputs: inputs, (n, features).
+
+        Returns:
+            Q, (n, actions).
         """
         hidden = inputs[..., None]
         weight, bias = self.layers[-1]
@@ -246,11 +281,16 @@ class QNetwork:
             return np.asarray((np.matmul(weight, hidden) + bias[:, None])[..., 0])
 
     def values_at_once(self, inputs: FloatArray) -> NDArray[np.float32]:
-        """Return Q, (n, actions), in float32 by products of whole matrices.
+        """Compute Q in float32 by products of whole matrices, for training and searching.
 
-        Several times faster for many rows. Products of one size give the same row with any other
-        rows, but no library promises that to the last bit: for training and searching, not for
-        driving.
+        It is several times faster than `values` for many rows. Products of one size give the same
+        row with any other rows, but no library promises that to the last bit, as driving needs it.
+
+        Args:
+            inputs: inputs, (n, features).
+
+        Returns:
+            Q, (n, actions).
         """
         n = len(inputs)
         rows: NDArray[np.float32] = np.zeros(
@@ -269,34 +309,45 @@ class QNetwork:
         return values[:n]
 
     def greedy(self, inputs: FloatArray) -> NDArray[np.int64]:
-        """Return the actions of the highest Q by `values`, (n,); -1 where Q is not finite.
+        """Choose the actions of the highest Q by `values`.
 
-        Of many rows float32 decides those whose best action leads by more than its error.
+        Float32 decides the rows whose best action leads by more than its error.
+
+        Args:
+            inputs: inputs, (n, features).
+
+        Returns:
+            Indices of actions, (n,); -1 where Q is not finite.
         """
-        if len(inputs) < MANY_ROWS:
-            return _highest(self.values(inputs))
         with np.errstate(over="ignore", invalid="ignore"):
             quick = self.values_at_once(inputs)
             second, first = np.partition(quick, -2, axis=1)[:, -2:].T
             sure = first - second > SINGLE_ERROR * (1.0 + np.abs(quick).max(axis=1))
         actions: NDArray[np.int64] = quick.argmax(axis=1)
-        unsure = np.flatnonzero(~sure)
-        actions[unsure] = _highest(self.values(inputs[unsure]))
+        values = self.values(inputs[~sure])
+        actions[~sure] = np.where(np.isfinite(values).all(axis=1), values.argmax(axis=1), -1)
         return actions
 
 
-def _highest(values: FloatArray) -> NDArray[np.int64]:
-    """Return the columns of the highest values, (n,), of (n, m); -1 where one is not finite."""
-    highest: NDArray[np.int64] = values.argmax(axis=1)
-    highest[~np.isfinite(values).all(axis=1)] = -1
-    return highest
-
-
 class LevelKDriver(Driver):
-    """Takes the action of the highest Q every 0.5 s and holds it."""
+    """Takes the action of the highest Q every 0.5 s and holds it.
+
+    Example:
+        driver = LevelKDriver(corridors=1, network=load_network("vut1"))
+        driver.begin(0, case)
+        a_mps2 = driver.act(scene)
+
+    Attributes:
+        network: the network, trained as POV or as VUT.
+    """
 
     def __init__(self, corridors: int, network: QNetwork) -> None:
-        """Drive as POV or VUT, depending on the training of the network."""
+        """Drive by a network.
+
+        Args:
+            corridors: number of corridors, K.
+            network: the network.
+        """
         super().__init__(corridors)
         self.network = network
         self._svo_rad = np.zeros(corridors)
@@ -306,29 +357,41 @@ class LevelKDriver(Driver):
         """The scenario with the network's limit of braking."""
 
     def begin(self, corridor: int, case: Case) -> None:
-        """Take the scenario and the social value orientation of the case."""
+        """Take the scenario and the social value orientation of a case.
+
+        Args:
+            corridor: index of the corridor.
+            case: the case of the next episode.
+        """
         self._svo_rad[corridor] = case.svo_rad or 0.0
         if case.scenario is not self.scenario:
             self._limited = self.network.limited(case.scenario)
         super().begin(corridor, case)
 
     def act(self, scene: Scene) -> FloatArray:
-        """Return the held accelerations, decided again where a decision is due.
+        """Return the held accelerations, (K,), after a decision where one is due.
 
         They are NaN where an action value is not finite.
+
+        Args:
+            scene: the present state.
         """
         due = np.flatnonzero((scene.step % DECISION_STEPS == 0) & scene.active)
         if not due.size:
             return self._held
         columns = scene.x_pov_m, scene.v_pov_mps, scene.x_vut_m, scene.v_vut_mps
         state = [column[due] for column in columns]
-        svo_rad = self._svo_rad[due] if self.network.sees_svo else None
-        inputs = features(state, svo_rad, scenario=self._limited)
+        inputs = self.network.observe(state, self._svo_rad[due], self._limited)
         actions = self.network.greedy(inputs)
         self._held[due] = np.where(actions < 0, np.nan, actions_mps2(self._limited)[actions])
         return self._held
 
     def reason(self, corridor: int) -> str | None:
-        """Return why the answer for a corridor is NaN."""
-        finite = bool(np.isfinite(self._held[corridor]))
-        return None if finite else "its policy gives action values that are not finite"
+        """Return why the answer for a corridor is NaN; None for a finite one.
+
+        Args:
+            corridor: index of the corridor.
+        """
+        if np.isfinite(self._held[corridor]):
+            return None
+        return "its policy gives action values that are not finite"

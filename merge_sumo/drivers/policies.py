@@ -33,7 +33,11 @@ HUMAN = "human"
 
 
 def policies_of(scenario: Scenario) -> Path:
-    """Return the shipped policies for a scenario: those of its name, else those for us23."""
+    """Return the folder of the shipped policies of a scenario's name, else that of us23.
+
+    Args:
+        scenario: a scenario, shipped or of the user.
+    """
     by_name = {name: folder for name, folder in _shipped().items() if name != HUMAN}
     return by_name.get(scenario.name, resource("policies"))
 
@@ -47,7 +51,11 @@ def _shipped() -> dict[str, Path]:
 
 
 def policies_name(folder: Path) -> str:
-    """Return the name of a shipped library, which any installation knows, else the whole path."""
+    """Return the name of a shipped library, which any installation knows, else the whole path.
+
+    Args:
+        folder: folder of policies.
+    """
     return folder.name if folder in _shipped().values() else str(folder)
 
 
@@ -62,27 +70,34 @@ def policies_in(folder: str | Path) -> Path:
     """
     path, shipped = Path(folder), _shipped().get(str(folder))
     try:
-        is_library = (path / MANIFEST).is_file()
-        if shipped is None and is_library:
-            return path.resolve()
-        if shipped is not None and is_library and path.resolve() != shipped.resolve():
+        named = path.resolve() if (path / MANIFEST).is_file() else None
+    except (OSError, ValueError):
+        named = None
+    if shipped is not None:
+        if named not in (None, shipped.resolve()):
             raise UserError(
                 f"`policies`: {folder} is a shipped library and a folder here: name the folder "
                 "by its whole path, or another folder to run in"
             )
-        problem = "has no manifest" if path.is_dir() else "is not a folder"
-    except (OSError, ValueError, RuntimeError) as error:
-        problem = f"cannot be read ({getattr(error, 'strerror', None) or error})"
-    if shipped is not None:
         return shipped
-    raise UserError(
-        f"`policies`: {folder} {problem}: name a folder of policies, such as `merge-sumo train "
-        f"--out DIR` makes, or a shipped library: {', '.join(sorted(_shipped()))}"
-    )
+    if named is None:
+        raise UserError(
+            f"`policies`: {folder} has no readable manifest: name a folder of policies, such as "
+            "`merge-sumo train --out DIR` makes, or a shipped library: "
+            f"{', '.join(sorted(_shipped()))}"
+        )
+    return named
 
 
 def policies_sha256(folder: Path) -> dict[str, str]:
-    """Return the hashes of the networks of a folder by name."""
+    """Return the hashes of the networks of a folder by name.
+
+    Args:
+        folder: folder of policies.
+
+    Raises:
+        UserError: if the manifest cannot be read.
+    """
     return {name: entry["sha256"] for name, entry in read_manifest(folder).items()}
 
 
@@ -91,7 +106,14 @@ class _Manifest(Record, frozen=True):
 
 
 def read_manifest(folder: Path | None = None) -> dict[str, dict[str, Any]]:
-    """Return the entries of a manifest by name; none before a training."""
+    """Return the entries of a manifest by name of the network; none before a training.
+
+    Args:
+        folder: folder of policies; None for the shipped ones of us23.
+
+    Raises:
+        UserError: if the manifest cannot be read.
+    """
     path = (folder or resource("policies")) / MANIFEST
     if not path.is_file():
         return {}
@@ -107,13 +129,20 @@ def read_manifest(folder: Path | None = None) -> dict[str, dict[str, Any]]:
 
 
 def scenario_record(scenario: Scenario) -> dict[str, Any]:
-    """Return the entry of a manifest for the scenario that a network was trained for."""
+    """Return the entry of a manifest for the scenario that a network was trained for.
+
+    Args:
+        scenario: the scenario.
+    """
     record = to_plain(scenario)
     return {name: record[name] for name in ("name", *PLAYED, *LIMITS)}
 
 
 def scenario_of(entry: dict[str, Any]) -> Scenario:
     """Return the scenario that a network was trained for, without its road; us23 by default.
+
+    Args:
+        entry: entry of the network in a manifest.
 
     Raises:
         UserError: if the manifest has other entries for it.
@@ -125,12 +154,24 @@ def scenario_of(entry: dict[str, Any]) -> Scenario:
 
 
 def plays_as(one: Scenario, other: Scenario) -> bool:
-    """Return whether a driver learns the same in two scenarios."""
+    """Return whether a driver learns the same in two scenarios.
+
+    Args:
+        one: a scenario.
+        other: another one.
+    """
     return all(getattr(one, name) == getattr(other, name) for name in PLAYED)
 
 
 def load_network(name: str, folder: Path | None = None) -> QNetwork:
-    """Return a network of a folder, by default that of the shipped policies.
+    """Load a network.
+
+    Args:
+        name: name of the network, such as "pov1".
+        folder: folder of policies; None for the shipped ones of us23.
+
+    Returns:
+        The network; the same object for the same file.
 
     Raises:
         UserError: if it is missing, or is not the file of its manifest.
@@ -148,7 +189,11 @@ def load_network(name: str, folder: Path | None = None) -> QNetwork:
 
 
 def how_to_train(folder: Path) -> str:
-    """Return the end of a sentence on a missing network."""
+    """Return the end of a sentence on a missing network.
+
+    Args:
+        folder: folder of policies.
+    """
     if folder == resource("policies"):
         return ": run `merge-sumo train` to make it"
     return f" in {folder}: run `merge-sumo train --out {quoted(folder)}` to make it"
@@ -176,12 +221,15 @@ def _parse(content: bytes, path: str, sha256: str, name: str) -> QNetwork:
 
 
 def load_driver(name: str, corridors: int, folder: Path | None = None) -> LevelKDriver:
-    """Return the driver that acts by a network.
+    """Load a network, and return the driver that acts by it.
 
     Args:
-        name: name of the network.
-        corridors: number of corridors.
-        folder: folder of the networks; by default the shipped ones.
+        name: name of the network, such as "vut1".
+        corridors: number of corridors, K.
+        folder: folder of policies; None for the shipped ones of us23.
+
+    Raises:
+        UserError: if the network is missing, or is not the file of its manifest.
     """
     return LevelKDriver(corridors, load_network(name, folder))
 

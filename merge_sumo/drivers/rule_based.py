@@ -53,16 +53,27 @@ DESIGNS = {
 
 
 class RuleBasedVut(Level0Vut):
-    """Follows the level-0 profile, coasts for a predicted short gap, finally regulates the gap.
+    """A VUT that follows the level-0 profile, coasts for a short gap, then regulates the gap.
 
     All stages predict dx at M with the POV at constant speed and the VUT on the level-0 profile.
     Before x1 the VUT follows that profile. From x1 to x2 it coasts while the predicted |dx| is too
     small. From x2 on it then sets its acceleration by a PID on the predicted dx, towards +target:
     it gives way and falls back behind the POV.
+
+    Example:
+        driver = RuleBasedVut(corridors=1, design=DESIGNS["design2"])
+
+    Attributes:
+        design: the parameters.
     """
 
     def __init__(self, corridors: int, design: RuleBasedDesign) -> None:
-        """Prepare a controller of this design for each corridor."""
+        """Begin in stage 1 in all corridors.
+
+        Args:
+            corridors: number of corridors, K.
+            design: the parameters.
+        """
         super().__init__(corridors)
         self.design = design
         self._integral = np.zeros(corridors)
@@ -71,13 +82,22 @@ class RuleBasedVut(Level0Vut):
         self._actuator = np.zeros(corridors)
 
     def begin(self, corridor: int, case: Case) -> None:
-        """Reset the PID and the actuator of a corridor."""
+        """Reset the PID and the actuator of a corridor.
+
+        Args:
+            corridor: index of the corridor.
+            case: the case of the next episode.
+        """
         super().begin(corridor, case)
         self._regulated[corridor] = False
         self._actuator[corridor] = 0.0
 
     def act(self, scene: Scene) -> FloatArray:
-        """Return the commanded acceleration, (K,), after the actuator's lag if there is one."""
+        """Return the commanded acceleration, (K,), after the lag of the actuator.
+
+        Args:
+            scene: the present state.
+        """
         design = self.design
         distance = scene.distance_m
         dx_at_m = scene.dx_at_m(level0_time_to(distance, scene.v_vut_mps, self.scenario))
@@ -85,8 +105,7 @@ class RuleBasedVut(Level0Vut):
         too_close = (np.abs(dx_at_m) < design.gap_m) & (distance <= design.x1_m)
         command[too_close] = 0.0
         regulate = too_close & (distance <= design.x2_m)
-        if regulate.any():
-            command[regulate] = self._pid(dx_at_m)[regulate]
+        command = np.where(regulate, self._pid(dx_at_m), command)
         self._regulated = regulate
         if design.lag_s <= 0.0:
             return command

@@ -15,7 +15,11 @@ X, V = range(2)
 
 
 def far_m(scenario: Scenario) -> float:
-    """Return the distant position at which a hidden car is shown."""
+    """Return the distant position at which a hidden car is shown, in m.
+
+    Args:
+        scenario: the scenario.
+    """
     ahead = 1.0 if scenario.mainline == scenario.ramp else -1.0
     return scenario.x_vut0_m + ahead * scenario.farthest_start_m
 
@@ -81,15 +85,27 @@ class SensedDriver(DriverWrapper):
     A hidden car is shown out of the way, at the speed of the VUT: as far behind the start of the
     VUT as a car may start before M (on a road of one lane, as far ahead of it). The VUT's own state
     is exact and has no delay.
+
+    Example:
+        driver = SensedDriver(RuleBasedVut(1, DESIGNS["design2"]))
     """
 
     def __init__(self, driver: Driver) -> None:
-        """Take the driver."""
+        """Wrap a driver.
+
+        Args:
+            driver: sees what the sensors show.
+        """
         super().__init__(driver)
         self._sensors: dict[int, _Sensors] = {}
 
     def begin(self, corridor: int, case: Case) -> None:
-        """Take the sensors of a case; the driver begins with the start that they show."""
+        """Take the sensors of a case; the driver begins with the start that they show.
+
+        Args:
+            corridor: index of the corridor.
+            case: the case of the next episode.
+        """
         self._sensors[corridor] = sensors = _Sensors(case)
         shown = ObservedCase(
             observed=tuple(map(tuple, sensors.shown(sensors.start).T.tolist())),
@@ -102,7 +118,11 @@ class SensedDriver(DriverWrapper):
         super().begin(corridor, shown)
 
     def act(self, scene: Scene) -> FloatArray:
-        """Return the answers of the driver to the scene that it sees, (K,)."""
+        """Return the answers of the driver to the scene that it sees, (K,).
+
+        Args:
+            scene: the present state.
+        """
         x_m, v_mps, conflicting = scene.x_m.copy(), scene.v_mps.copy(), scene.conflicting
         for corridor in np.flatnonzero(scene.active).tolist():
             sensors = self._sensors[corridor]

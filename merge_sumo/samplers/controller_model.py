@@ -13,7 +13,6 @@ from merge_sumo.drivers.levelk import (
     DECISION_STEPS,
     QNetwork,
     actions_mps2,
-    features,
     prospects,
 )
 from merge_sumo.drivers.policies import load_network
@@ -306,13 +305,13 @@ class ModelRollout:
         svo_rad: FloatArray,
     ) -> FloatArray:
         """Return the accelerations that the cars of the mainline choose, (C, R)."""
-        limited, count = network.limited(self.scenario), len(cars)
+        count = len(cars)
         vut = np.tile(x_m[VUT], count), np.tile(v_mps[VUT], count)
         state = (x_m[cars].ravel(), v_mps[cars].ravel(), *vut)
-        seen_rad = np.tile(svo_rad, count) if network.sees_svo else None
-        inputs = features(state, seen_rad, scenario=limited)
+        inputs = network.observe(state, np.tile(svo_rad, count), self.scenario)
         chosen = network.values_at_once(inputs).argmax(axis=1)
-        chosen_mps2: FloatArray = actions_mps2(limited)[chosen].reshape(count, -1)
+        actions = actions_mps2(network.limited(self.scenario))
+        chosen_mps2: FloatArray = actions[chosen].reshape(count, -1)
         return chosen_mps2
 
 

@@ -34,6 +34,10 @@ def simulate(plan: SimulationPlan, cases: Sequence[Case]) -> list[Episode]:
 
     Where the plan has an earlier version of the VUT, each episode has that of the earlier version.
 
+    Args:
+        plan: how they run.
+        cases: cases of the scenario of the plan.
+
     Example:
         case = Case(level=0, x_pov0_m=-250.0, v_pov0_mps=30.0, scenario=plan.scenario)
         (episode,) = simulate(plan, [case])
@@ -57,8 +61,8 @@ def simulate_part(
     Raises:
         UserError: if the plan cannot be carried out.
     """
-    if plan.against is not None:
-        return list(map(keep, _simulate_both(plan, cases)))
+    if (earlier := plan.earlier) is not None:
+        return list(map(keep, _simulate_both(plan, earlier, cases)))
     with opened_simulator(plan) as simulator:
         trajectories = simulator.run(cases)
         files, pov_files = hashed(simulator.vut.files()), hashed(simulator.pov.files())
@@ -78,13 +82,25 @@ def simulate_part(
 
 
 def with_measures(episode: Episode) -> Episode:
-    """Return an episode after all its measures are computed."""
+    """Compute all measures of an episode, and return it.
+
+    An episode that travels to another process leaves its trajectory behind, so that its measures
+    are computed before.
+
+    Args:
+        episode: an episode with its trajectory.
+    """
     episode.outcome.measures.compute_all()
     return episode
 
 
-def lost(plan: SimulationPlan, case: Case) -> Episode:
-    """Return the episode of a case that ended its worker process each time that it ran."""
+def lost_episode(plan: SimulationPlan, case: Case) -> Episode:
+    """Return the episode of a case that ended its worker process each time that it ran.
+
+    Args:
+        plan: how it ran.
+        case: the case.
+    """
     start = [[(x, v, 0.0) for x, v in case.starts()]]
     error = "its worker process died twice"
     trajectory = Trajectory(case, np.array(start), End.SIM_ERROR, error)
@@ -105,15 +121,15 @@ def evaluate(
         plan: how they run.
         cases: cases of the scenario of the plan.
         workers: where they run; None for this process, which keeps its simulator open.
-        keep: gives the part of an episode that travels to this process, such as `with_measures`. A
-            function that is found by its name.
+        keep: gives the part of an episode that travels to this process, such as `with_measures`; a
+            function of a module, so that a worker can import it.
 
     Raises:
         UserError: if the plan cannot be carried out.
     """
 
     def lost_part(case: Case) -> R:
-        return keep(lost(plan, case))
+        return keep(lost_episode(plan, case))
 
     available = Workers() if workers is None else workers
     chunk = CHUNK if plan.engine is Engine.KINEMATIC else None
@@ -121,7 +137,11 @@ def evaluate(
 
 
 def open_simulators(plan: SimulationPlan, workers: Workers) -> None:
-    """Open the simulator of a plan in a worker, and have all workers started.
+    """Start all workers, and open the simulator of a plan in one of them.
+
+    Args:
+        plan: the plan.
+        workers: the workers.
 
     Raises:
         UserError: if the plan cannot be carried out.
@@ -143,7 +163,14 @@ _one_at_a_time = RLock()
 
 @contextmanager
 def opened_simulator(plan: SimulationPlan) -> Iterator[Simulator]:
-    """Give the simulator of this process, which stays open for the next chunk of the same plan."""
+    """Give the simulator of this process, which stays open for the next chunk of the same plan.
+
+    Args:
+        plan: the plan.
+
+    Raises:
+        UserError: if the plan cannot be carried out.
+    """
     global _kept  # noqa: PLW0603 (one SUMO per process)
     with _one_at_a_time:
         try:
@@ -177,22 +204,23 @@ def _outcomes(plan: SimulationPlan, trajectories: Sequence[Trajectory]) -> list[
     """Return the outcomes of trajectories; only the measures that judge them are computed."""
     measured = measures_of(trajectories, centre_lines(plan.road))
     outcomes = []
-    for place, (trajectory, measures) in enumerate(zip(trajectories, measured, strict=True)):
+    for index, (trajectory, measures) in enumerate(zip(trajectories, measured, strict=True)):
         margin = plan.criterion.margin(trajectory, measures)
-        outcomes.append(Outcome(place, 0, trajectory.case, measures, margin=margin))
+        outcomes.append(Outcome(index, 0, trajectory.case, measures, margin=margin))
     return outcomes
 
 
-def _simulate_both(plan: SimulationPlan, cases: Sequence[Case]) -> list[Episode]:
+def _simulate_both(
+    plan: SimulationPlan, earlier: SimulationPlan, cases: Sequence[Case]
+) -> list[Episode]:
     """Run cases with both versions of the VUT, first with the one whose simulator is open."""
-    new, old = replace(plan, against=None), plan.earlier
-    assert old is not None, "the plan has two versions"  # noqa: S101
-    if _kept is not None and _kept[0] == _key(old):
-        before = simulate(old, cases)
-        after = simulate(new, cases)
+    plan = replace(plan, against=None)
+    if _kept is not None and _kept[0] == _key(earlier):
+        before = simulate(earlier, cases)
+        after = simulate(plan, cases)
     else:
-        after = simulate(new, cases)
-        before = simulate(old, cases)
+        after = simulate(plan, cases)
+        before = simulate(earlier, cases)
     return [replace(a, earlier=b) for a, b in zip(after, before, strict=True)]
 
 

@@ -1,4 +1,4 @@
-"""K corridors that are moved by the equations of motion of the paper alone, without SUMO.
+"""The kinematic simulation: K corridors by the equations of motion of the paper, without SUMO.
 
 SUMO holds the same state to 1e-9 m (`sumo/sumo_simulation.py` checks that in every step).
 """
@@ -25,6 +25,8 @@ class KinematicSimulation:
         simulation.command(a_mps2)
 
     Attributes:
+        corridors: number of corridors.
+        vehicles: number of vehicles A in each.
         x_m: positions, (A, corridors).
         v_mps: speeds, (A, corridors).
     """
@@ -61,16 +63,22 @@ class KinematicSimulation:
         self.x_m[:, corridor], self.v_mps[:, corridor] = np.array(starts).T
 
     def park(self, corridor: int) -> None:
-        """Park the vehicles of a corridor."""
+        """Park the vehicles of a corridor.
+
+        Args:
+            corridor: index of the corridor.
+        """
         self.x_m[:, corridor], self.v_mps[:, corridor] = -PARKING_M, 0.0
 
     def advance(self) -> None:
-        """Do nothing: `command` makes the whole step."""
+        """Leave the step to `command`; SUMO makes the first half of a step here."""
 
     def command(self, a_mps2: FloatArray, merged: NDArray[np.bool_] | None = None) -> None:
-        """Move all vehicles by one step of eq. (4) with accelerations, (A, corridors).
+        """Move all vehicles by one step of eq. (4).
 
-        Both lanes of a merge have one coordinate, so `merged` changes nothing here.
+        Args:
+            a_mps2: accelerations, (A, corridors).
+            merged: not used, because both lanes of a merge have one coordinate.
         """
         if self.substeps > 1:
             self._in_parts(a_mps2)

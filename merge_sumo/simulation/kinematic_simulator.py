@@ -38,13 +38,20 @@ ROUNDING = 1e-6
 
 
 class KinematicSimulator(Simulator):
-    """A VUT and the POVs in eq. (4), without SUMO but for the cases that it checks.
+    """A VUT and the POVs by eq. (4), with SUMO only for the cases that it checks.
 
     A plan with a shorter step than that of SUMO has no such cases.
+
+    Example:
+        with KinematicSimulator(plan.with_engine("kinematic")) as simulator:
+            trajectories = simulator.run(cases)
     """
 
     def __init__(self, plan: SimulationPlan) -> None:
         """Start the drivers; SUMO starts with the first case that it checks.
+
+        Args:
+            plan: the plan.
 
         Raises:
             UserError: if a driver needs SUMO.
@@ -59,6 +66,9 @@ class KinematicSimulator(Simulator):
 
     def run(self, cases: Sequence[Case]) -> list[Trajectory]:
         """Run cases; return their trajectories in order.
+
+        Args:
+            cases: cases of the scenario of the plan.
 
         Raises:
             UserError: if a case ends otherwise in SUMO.
@@ -122,6 +132,9 @@ def drawn(cases: Sequence[Case]) -> set[int]:
     """Return the indices of the cases that are drawn at random to be checked.
 
     The cases are the seed, so that the same are drawn in any worker.
+
+    Args:
+        cases: at least one case.
     """
     seed = zlib.crc32(repr((cases[0].level, cases[0].starts())).encode())
     count = math.ceil(CHECKED_SHARE * len(cases))

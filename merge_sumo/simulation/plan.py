@@ -106,6 +106,9 @@ class SimulationPlan:
         The files of a VUT are left out, because all of them are known only after it drove. Where
         code of a user runs, the working folder is included, because the same name may be another
         file in another folder.
+
+        Args:
+            level: the POV level; by default own, which includes the POV of the user.
         """
         own = self.povs.own if level == OWN else None
         vut, pov = str(self.vut.spec), None if own is None else str(own.spec)
@@ -130,7 +133,11 @@ class SimulationPlan:
         return replace(self, vut=self.against, against=None)
 
     def at_level(self, level: int) -> SimulationPlan:
-        """Return the plan for the cases of a level, without the POV of the user at others."""
+        """Return the plan for the cases of a level: without the POV of the user at other levels.
+
+        Args:
+            level: the POV level.
+        """
         if level == OWN:
             return self
         return replace(self, povs=replace(self.povs, own=None))
@@ -142,7 +149,10 @@ class SimulationPlan:
         return replace(self, scenario=replace(self.scenario, follow_up_s=0.0))
 
     def with_engine(self, engine: str | None) -> SimulationPlan:
-        """Return the plan with an engine; None is the kinematic one where the drivers allow it.
+        """Return the plan with an engine.
+
+        Args:
+            engine: name of the engine; None for the kinematic one where the drivers allow it.
 
         Raises:
             UserError: if the name is unknown, or the drivers do not allow the engine.
@@ -204,11 +214,19 @@ class SimulationPlan:
         return count
 
     def for_cases(self, cases: int) -> SimulationPlan:
-        """Return the plan with no more corridors than there are cases to run at a time."""
+        """Return the plan with no more corridors than there are cases to run at a time.
+
+        Args:
+            cases: number of cases.
+        """
         return replace(self, corridors=min(self.corridors, cases))
 
     def with_log(self, log: Path) -> SimulationPlan:
-        """Return the plan with a file for the output of the drivers of the user."""
+        """Return the plan with a file for the output of the drivers of the user.
+
+        Args:
+            log: the file.
+        """
         against = None if self.against is None else self.against.with_log(log)
         povs = self.povs.with_log(log)
         return replace(self, vut=self.vut.with_log(log), against=against, povs=povs)
@@ -228,12 +246,15 @@ class SimulationPlan:
 
 
 def differences(was: Any, now: Any, name: str = "") -> dict[str, tuple[Any, Any]]:
-    """Return by name where two records differ, with both values; None for one that is missing.
+    """Compare two records.
 
     Args:
         was: the earlier record.
         now: the present record.
         name: name of the record, before a dot.
+
+    Returns:
+        Both values of each entry that differs, by its name; None for a missing one.
     """
     if isinstance(was, dict) and isinstance(now, dict):
         differing: dict[str, tuple[Any, Any]] = {}

@@ -11,11 +11,10 @@ from merge_sumo.drivers.after_merge import PovAfterMerge
 from merge_sumo.drivers.base import Driver
 from merge_sumo.drivers.sensing import SensedDriver
 from merge_sumo.scenario.case import Case
-from merge_sumo.scenario.scenario import Scenario
 from merge_sumo.scenario.trajectory import Trajectory
 from merge_sumo.simulation.kinematic_simulation import KinematicSimulation
 from merge_sumo.simulation.plan import SimulationPlan
-from merge_sumo.simulation.povs import PovLibrary, Povs
+from merge_sumo.simulation.povs import PovLibrary
 from merge_sumo.simulation.rollout import Rollout
 from merge_sumo.sumo.sumo_simulation import SumoSimulation
 
@@ -28,7 +27,9 @@ class Simulator:
             trajectories = simulator.run(cases)
 
     Attributes:
-        simulation: the simulation of SUMO, or of the engine of a subclass.
+        simulation: the simulation of SUMO, or that of a subclass.
+        vut: drives the VUTs of all corridors.
+        pov: drives the cars of the mainline in all corridors.
         in_sumo: indices of the cases of the last `run` that SUMO ran.
         ran_again: indices of those that ran again, because a process was ended from outside.
     """
@@ -40,14 +41,22 @@ class Simulator:
     ran_again: Collection[int] = ()
 
     def __init__(self, plan: SimulationPlan) -> None:
-        """Start SUMO and the drivers, with the number of corridors that all of these can serve."""
+        """Start SUMO and the drivers, with the number of corridors that all of these can serve.
+
+        Args:
+            plan: the plan.
+
+        Raises:
+            UserError: if the plan cannot be carried out.
+        """
         own = plan.povs.own
-        car_type = None if own is None else own.vut_type
         with ExitStack() as opened:
             simulation = SumoSimulation(
-                *(corridors_of(plan, plan.corridors), plan.road, plan.vut.vut_type),
+                corridors_of(plan, plan.corridors),
+                plan.road,
+                plan.vut.vut_type,
                 scenario=plan.scenario,
-                car_type=car_type,
+                car_type=None if own is None else own.vut_type,
             )
             opened.callback(simulation.close)
             self._open_drivers(plan, simulation, opened)
@@ -73,12 +82,19 @@ class Simulator:
         if not scenario.act.is_perfect:
             self.vut = ActuatedDriver(self.vut)
         opened.callback(self.vut.close)
-        self.pov = povs_for(scenario, plan.povs, simulation.corridors, sumo)
+        cars = simulation.corridors * (scenario.vehicles - 1)
+        self.pov = PovLibrary(cars, plan.povs, sumo)
+        if scenario.lane_m is not None or scenario.follow_up_s > 0.0:
+            self.pov = PovAfterMerge(self.pov)
         opened.callback(self.pov.close)
         self._opened = opened.pop_all()
 
     def run(self, cases: Sequence[Case]) -> list[Trajectory]:
-        """Run cases; return their trajectories in order."""
+        """Run cases; return their trajectories in order.
+
+        Args:
+            cases: cases of the scenario of the plan.
+        """
         self.in_sumo = range(len(cases)) if isinstance(self.simulation, SumoSimulation) else ()
         rollout = Rollout(self.simulation, self.pov, self.vut, cases)
         trajectories = rollout.run()
@@ -97,22 +113,14 @@ class Simulator:
 
 
 def corridors_of(plan: SimulationPlan, most: int) -> int:
-    """Return the number of corridors, `most` or fewer, that VUT and POVs of a plan can serve."""
-    corridors = min(most, plan.vut.max_corridors or most)
-    return plan.povs.corridors(corridors, plan.scenario.vehicles - 1)
-
-
-def povs_for(
-    scenario: Scenario, povs: Povs, corridors: int, sumo: SumoSimulation | None = None
-) -> Driver:
-    """Return the drivers of the mainline of a scenario, for the cars of K `corridors`.
+    """Return the number of corridors that VUT and POVs of a plan can serve.
 
     Args:
-        scenario: the scenario.
-        povs: drivers of the POV by level.
-        corridors: number of corridors, K.
-        sumo: the simulation, for drivers of SUMO.
+        plan: the plan.
+        most: largest number.
+
+    Raises:
+        UserError: if the POV of the user drives fewer cars than the scenario has.
     """
-    library = PovLibrary(corridors * (scenario.vehicles - 1), povs, sumo)
-    drives_on = scenario.lane_m is not None or scenario.follow_up_s > 0.0
-    return PovAfterMerge(library) if drives_on else library
+    corridors = min(most, plan.vut.max_corridors or most)
+    return plan.povs.corridors(corridors, plan.scenario.vehicles - 1)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from merge_sumo.drivers.levelk import ACTIONS, LEVEL0_GAP_FEATURE, QNetwork
 from merge_sumo.scenario.case import FloatArray
-from merge_sumo.training.game import Game, IntArray, inputs_of
+from merge_sumo.training.game import Game, IntArray
 
 CHUNK = 16
 """Cases that are searched at a time."""
@@ -49,7 +49,8 @@ def _best_of_all_paths(game: Game, state: FloatArray, known: FloatArray) -> Floa
     for _ in range(game.max_decisions):
         cases, state, so_far, over = _continued(game, svo_rad, cases, state, so_far)
         np.maximum.at(best, cases[over], so_far[over])
-        alive = _can_improve(game, best, cases, so_far, over)
+        # The rest of a game wins at most the reward of a full gap.
+        alive = np.flatnonzero(~over & (so_far + game.reward.weights.gap > best[cases]))
         kept = _best_of_each(cases[alive], state[alive, own], so_far[alive], same)
         while len(kept) > MAX_STATES:
             same *= 2.0
@@ -78,20 +79,6 @@ def _continued(
     cases, so_far = np.repeat(cases, ACTIONS), np.repeat(so_far, ACTIONS)
     state, reward, over = game.advance(np.repeat(state, ACTIONS, axis=0), svo_rad[cases], a_mps2)
     return cases, state, so_far + reward, over
-
-
-def _can_improve(
-    game: Game,
-    best: FloatArray,
-    cases: IntArray,
-    so_far: FloatArray,
-    over: NDArray[np.bool_],
-) -> IntArray:
-    """Return the indices of the paths that may exceed the best returns of their cases.
-
-    The rest of a game wins at most the reward of a full gap.
-    """
-    return np.flatnonzero(~over & (so_far + game.reward.weights.gap > best[cases]))
 
 
 def _best_of_each(cases: IntArray, own: FloatArray, so_far: FloatArray, same: float) -> IntArray:
@@ -141,8 +128,8 @@ def beam_search(
         ended = ended[np.argsort(so_far[ended], kind="stable")]
         ended = ended[so_far[ended] > best[cases[ended]]]
         best[cases[ended]], best_plan[cases[ended]] = so_far[ended], plan[ended]
-        alive = _can_improve(game, best, cases, so_far, over)
-        inputs = inputs_of(agent, state[alive], svo_rad[cases[alive]], game.scenario)
+        alive = np.flatnonzero(~over & (so_far + game.reward.weights.gap > best[cases]))
+        inputs = agent.observe(state[alive].T, svo_rad[cases[alive]], game.scenario)
         # The networks give squashed returns; only the order matters here.
         estimate = so_far[alive] + agent.values_at_once(inputs).max(axis=1)
         gap_class = np.clip(np.rint(inputs[:, LEVEL0_GAP_FEATURE] * 8.0), -8, 8)

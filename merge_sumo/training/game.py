@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from merge_sumo.drivers.level0 import level0_acceleration, level0_time_to
-from merge_sumo.drivers.levelk import ACTIONS, DECISION_STEPS, QNetwork, actions_mps2, features
+from merge_sumo.drivers.levelk import ACTIONS, DECISION_STEPS, QNetwork, actions_mps2
 from merge_sumo.scenario.case import FloatArray
 from merge_sumo.scenario.imperfection import Actuation, Sensing
 from merge_sumo.scenario.scenario import DT_S, Scenario, Units
@@ -222,28 +222,10 @@ def greedy(network: QNetwork, scenario: Scenario) -> Policy:
     """
 
     def choose(state: FloatArray, svo_rad: FloatArray) -> IntArray:
-        inputs = inputs_of(network, state, svo_rad, scenario)
+        inputs = network.observe(state.T, svo_rad, scenario)
         return np.asarray(network.values_at_once(inputs).argmax(axis=1))
 
     return choose
-
-
-def inputs_of(
-    network: QNetwork, state: FloatArray, svo_rad: FloatArray, scenario: Scenario
-) -> FloatArray:
-    """Compute the inputs of a network.
-
-    Args:
-        network: the network.
-        state: states, (n, 4).
-        svo_rad: psi of the POV, (n,), which not every network sees.
-        scenario: the scenario that is played.
-
-    Returns:
-        The inputs, (n, 26), or (n, 28) for a network that sees psi.
-    """
-    psi = svo_rad if network.sees_svo else None
-    return features(state.T, psi, scenario=network.limited(scenario))
 
 
 def pool_starts(n: int, rng: np.random.Generator, scenario: Scenario) -> FloatArray:

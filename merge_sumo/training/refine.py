@@ -34,7 +34,7 @@ from merge_sumo.scenario.case import FloatArray
 from merge_sumo.scenario.scenario import SVO
 from merge_sumo.training.best_response import beam_search
 from merge_sumo.training.ddqn import Learner, TrainingProgress, as_torch, export, squash
-from merge_sumo.training.game import Game, IntArray, exploring_starts, greedy, inputs_of
+from merge_sumo.training.game import Game, IntArray, exploring_starts, greedy
 
 BETTER = 1e-3
 """A game of the search is better than that of the policy where its return is higher by more."""
@@ -180,7 +180,7 @@ def _label(
     of games that are better than those of the policy, and a share of the others.
     """
     policy = greedy(network, game.scenario)
-    inputs = inputs_of(network, tried.at[:, :4], tried.at[:, 4], game.scenario)
+    inputs = network.observe(tried.at.T[:4], tried.at[:, 4], game.scenario)
     second, first = np.partition(network.values_at_once(inputs), -2, axis=1)[:, -2:].T
     some = rng.random(len(inputs)) < s.sure_share
     kept = np.flatnonzero((first - second < s.unsure) | tried.better | some)

@@ -25,7 +25,7 @@ from merge_sumo.errors import Notice, UserError
 from merge_sumo.scenario.case import from_unit
 from merge_sumo.scenario.scenario import US23
 from merge_sumo.scenario.trajectory import End
-from merge_sumo.simulation.evaluate import lost, simulate
+from merge_sumo.simulation.evaluate import lost_episode, simulate
 from merge_sumo.workers import (
     dask_workers,
     open_workers,
@@ -128,7 +128,7 @@ class TestAWorkerThatDies:
         cases = from_unit(np.random.default_rng(0).random((4, 2)), 0, scenario=US23)
         plan = plan_for("design1", corridors=4)
         work = partial(run_but_die_at, plan, {cases[2].x_pov0_m})
-        ran = list(two.run(work, cases, partial(lost, plan), chunk=1))
+        ran = list(two.run(work, cases, partial(lost_episode, plan), chunk=1))
         ends = [one.outcome.measures.end for one in ran]
         assert ends[2] is End.SIM_ERROR
         assert "worker process died twice" in ran[2].outcome.measures.error
