@@ -14,8 +14,6 @@ from merge_sumo.drivers.levelk import ACTIONS, LEVEL0_GAP_FEATURE, QNetwork
 from merge_sumo.scenario.case import FloatArray
 from merge_sumo.training.game import Game, IntArray
 
-CHUNK = 16
-"""Cases that are searched at a time."""
 SAME = 1e-2
 """States that differ by less, in m and m/s, count as one. Where the accelerations are multiples of
 0.2 m/s2, states lie on a lattice that is coarser."""
@@ -35,64 +33,61 @@ def best_response(game: Game, state: FloatArray, known: FloatArray) -> FloatArra
     Returns:
         The best returns, (n,).
     """
-    best = known.copy()
-    for first in range(0, len(state), CHUNK):
-        rows = slice(first, first + CHUNK)
-        best[rows] = _best_of_all_paths(game, state[rows], best[rows])
+    best = np.empty(len(state))
+    for case, start in enumerate(state):
+        best[case] = _best_of_all_paths(game, start, known[case])
     return best
 
 
-def _best_of_all_paths(game: Game, state: FloatArray, known: FloatArray) -> FloatArray:
+def _best_of_all_paths(game: Game, start: FloatArray, known: float) -> float:
+    """Return the best return from one start, (4,)."""
     own = slice(0, 2) if game.role == "pov" else slice(2, 4)
-    best, svo_rad = known.copy(), np.zeros(len(state))
-    cases, so_far, same = np.arange(len(state)), svo_rad, SAME
+    best, same = known, SAME
+    state, so_far = start[None], np.zeros(1)
     for _ in range(game.max_decisions):
-        cases, state, so_far, over = _continued(game, svo_rad, cases, state, so_far)
-        np.maximum.at(best, cases[over], so_far[over])
+        state, so_far, over = _continued(game, state, np.zeros(len(state)), so_far)
+        best = max(best, so_far[over].max(initial=-np.inf))
         # The rest of a game wins at most the reward of a full gap.
-        alive = np.flatnonzero(~over & (so_far + game.reward.weights.gap > best[cases]))
-        kept = _best_of_each(cases[alive], state[alive, own], so_far[alive], same)
+        alive = np.flatnonzero(~over & (so_far + game.reward.weights.gap > best))
+        kept = _best_of_each(state[alive, own], so_far[alive], same)
         while len(kept) > MAX_STATES:
             same *= 2.0
-            kept = _best_of_each(cases[alive], state[alive, own], so_far[alive], same)
-        alive = alive[kept]
-        cases, state, so_far = cases[alive], state[alive], so_far[alive]
+            kept = _best_of_each(state[alive, own], so_far[alive], same)
+        state, so_far = state[alive[kept]], so_far[alive[kept]]
     return best
 
 
 def _continued(
-    game: Game, svo_rad: FloatArray, cases: IntArray, state: FloatArray, so_far: FloatArray
-) -> tuple[IntArray, FloatArray, FloatArray, NDArray[np.bool_]]:
+    game: Game, state: FloatArray, svo_rad: FloatArray, so_far: FloatArray
+) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
     """Continue paths by one decision, each by all actions in turn.
 
     Args:
         game: the game.
-        svo_rad: psi of the POV of each case.
-        cases: indices of the cases of the paths, (n,).
-        state: their last states, (n, 4).
+        state: last states of the paths, (n, 4).
+        svo_rad: psi of the POV, (n,).
         so_far: their returns so far, (n,).
 
     Returns:
-        The cases, states and returns of the 7 n longer paths, and whether their games are over.
+        The states and returns of the 7 n longer paths, and whether their games are over.
     """
     a_mps2 = np.tile(game.actions_mps2, len(state))
-    cases, so_far = np.repeat(cases, ACTIONS), np.repeat(so_far, ACTIONS)
-    state, reward, over = game.advance(np.repeat(state, ACTIONS, axis=0), svo_rad[cases], a_mps2)
-    return cases, state, so_far + reward, over
+    state, svo_rad = np.repeat(state, ACTIONS, axis=0), np.repeat(svo_rad, ACTIONS)
+    state, reward, over = game.advance(state, svo_rad, a_mps2)
+    return state, np.repeat(so_far, ACTIONS) + reward, over
 
 
-def _best_of_each(cases: IntArray, own: FloatArray, so_far: FloatArray, same: float) -> IntArray:
+def _best_of_each(own: FloatArray, so_far: FloatArray, same: float) -> IntArray:
     """Return the indices of the best of the paths to each state.
 
     Args:
-        cases: indices of the starts, (n,).
         own: positions and speeds of the agent, (n, 2).
         so_far: returns so far, (n,).
         same: difference up to which states count as one, in m and m/s.
     """
     x, v = np.rint(own.T / same)
-    order = np.lexsort((-so_far, x, v, cases))
-    return order[_begins(np.array([cases, v, x])[:, order])]
+    order = np.lexsort((-so_far, x, v))
+    return order[_begins(np.array([v, x])[:, order])]
 
 
 def beam_search(
@@ -122,7 +117,8 @@ def beam_search(
     for decision in range(game.max_decisions):
         plan = np.repeat(plan, ACTIONS, axis=0)
         plan[:, decision] = np.tile(np.arange(ACTIONS), len(state))
-        cases, state, so_far, over = _continued(game, svo_rad, cases, state, so_far)
+        state, so_far, over = _continued(game, state, svo_rad[cases], so_far)
+        cases = np.repeat(cases, ACTIONS)
         ended = np.flatnonzero(over)
         # In rising order, so that the best of a case is written last.
         ended = ended[np.argsort(so_far[ended], kind="stable")]

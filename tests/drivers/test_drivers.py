@@ -6,11 +6,8 @@ import numpy as np
 import pytest
 from support.scenes import scene_of
 
-from merge_sumo.controllers.built_in import BUILT_IN_VUTS
-from merge_sumo.controllers.kinds import load
 from merge_sumo.drivers.level0 import Level0Pov, Level0Vut, level0_time_to
 from merge_sumo.drivers.rule_based import RuleBasedDesign, RuleBasedVut
-from merge_sumo.errors import UserError
 from merge_sumo.scenario.case import Case
 from merge_sumo.scenario.scenario import US23
 
@@ -91,13 +88,3 @@ class TestRuleBased:
         vut = self.make(lagged)
         answers = [vut.act(scene_of()).item() for _ in range(3)]
         assert answers == pytest.approx([0.1, 0.19, 0.271])
-
-
-def test_every_built_in_vut_makes_a_driver_and_unknown_names_are_refused():
-    for name in BUILT_IN_VUTS:
-        driver = load(name).open(4)
-        for k in range(4):
-            driver.begin(k, CASE)
-        assert driver.act(scene_of([-300.0, -250.0, -200.0, -180.0])).shape == (4,)
-    with pytest.raises(UserError, match=r"no VUT 'design9': did you mean design[12] or "):
-        load("design9")

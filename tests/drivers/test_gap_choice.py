@@ -23,7 +23,7 @@ def scene(x_m: list[float], v_mps: list[float], *, merged: bool = False) -> Scen
     return Scene(np.array([True]), np.array([9]), x, v, merged=np.array([merged]))
 
 
-def asked(x_m, v_mps, *, merged=False, choice=HEADWAY) -> tuple[float, int]:
+def answers(x_m, v_mps, *, merged=False, choice=HEADWAY) -> tuple[float, int]:
     """Return its answer and its merge request."""
     vut = GapChoiceVut(1, choice)
     begin(vut)
@@ -32,7 +32,7 @@ def asked(x_m, v_mps, *, merged=False, choice=HEADWAY) -> tuple[float, int]:
 
 
 @pytest.mark.parametrize(
-    ("x_pov", "v_pov", "wish"),
+    ("x_pov", "v_pov", "merge_request"),
     [
         (-70.0, 30.0, MERGE),  # behind, in the next step: -38 - 5 - (-67) = 24 m, 0.8 s at 30 m/s
         (-69.99, 30.0, STAY),
@@ -42,22 +42,22 @@ def asked(x_m, v_mps, *, merged=False, choice=HEADWAY) -> tuple[float, int]:
         (500.0, 30.0, MERGE),
     ],
 )
-def test_a_gap_is_accepted_by_its_time_gaps_in_the_next_step(x_pov, v_pov, wish):
-    assert asked([x_pov, -40.0], [v_pov, 20.0])[1] == wish
+def test_a_gap_is_accepted_by_its_time_gaps_in_the_next_step(x_pov, v_pov, merge_request):
+    assert answers([x_pov, -40.0], [v_pov, 20.0])[1] == merge_request
 
 
 def test_both_gaps_count_and_so_does_the_headway():
     between = [-75.0, -40.0, -10.0, -140.0], [30.0, 20.0, 20.0, 30.0]  # 29 m behind, 25 m ahead
-    assert asked(*between)[1] == MERGE
-    assert asked(*between, choice=GapChoice(headway_s=0.96))[1] == MERGE
-    assert asked(*between, choice=GapChoice(headway_s=0.97))[1] == STAY
-    assert asked([-75.0, -40.0, -21.0, -140.0], between[1])[1] == STAY
+    assert answers(*between)[1] == MERGE
+    assert answers(*between, choice=GapChoice(headway_s=0.96))[1] == MERGE
+    assert answers(*between, choice=GapChoice(headway_s=0.97))[1] == STAY
+    assert answers([-75.0, -40.0, -21.0, -140.0], between[1])[1] == STAY
 
 
 def test_it_requests_no_merge_before_the_gore_and_on_the_mainline():
-    assert asked([500.0, -72.1], [30.0, 20.0]) == (1.0, STAY)
-    assert asked([500.0, -72.0], [30.0, 20.0]) == (1.0, MERGE)
-    assert asked([500.0, -40.0], [30.0, 20.0], merged=True) == (1.0, NO_REQUEST)
+    assert answers([500.0, -72.1], [30.0, 20.0]) == (1.0, STAY)
+    assert answers([500.0, -72.0], [30.0, 20.0]) == (1.0, MERGE)
+    assert answers([500.0, -40.0], [30.0, 20.0], merged=True) == (1.0, NO_REQUEST)
 
 
 def test_without_a_lane_it_is_the_level_0_vut():
@@ -85,15 +85,14 @@ def test_without_a_gap_it_stands_before_the_end_of_the_lane_and_waits():
 
 
 def test_on_the_mainline_it_keeps_a_distance():
-    near, _ = asked([-30.0, -40.0], [15.0, 20.0], merged=True)
-    far, _ = asked([400.0, -40.0], [20.0, 20.0], merged=True)
+    near, _ = answers([-30.0, -40.0], [15.0, 20.0], merged=True)
+    far, _ = answers([400.0, -40.0], [20.0, 20.0], merged=True)
     assert near < -2.0
     assert 0.5 < far <= 1.0
 
 
-@pytest.mark.parametrize("name", ["us23-lane", "us23-lane-traffic"])
-def test_it_merges_in_sumo_and_a_longer_headway_merges_later(name):
-    scenario = named_scenario(name)
+def test_it_merges_in_sumo_and_a_longer_headway_merges_later():
+    scenario = named_scenario("us23-lane-traffic")
     mean_m = []
     for headway_s in (0.5, 1.2):
         ran = run_on(factory(f"gap?headway_s={headway_s}"), scenario, 0, 40)

@@ -38,9 +38,13 @@ def by_both(plan: SimulationPlan, cases: list[Case]) -> tuple[list[Episode], lis
 def assert_alike(sumo: list[Episode], kinematic: list[Episode]) -> None:
     for one, other in zip(sumo, kinematic, strict=True):
         assert one.trajectory.end is other.trajectory.end
+        after, expected = one.trajectory.after, other.trajectory.after
         np.testing.assert_allclose(
             one.trajectory.motion, other.trajectory.motion, rtol=0.0, atol=1e-9
         )
+        assert (after is None) == (expected is None)
+        if after is not None and expected is not None:
+            np.testing.assert_allclose(after, expected, rtol=0.0, atol=1e-9)
         verdict, ours = one.outcome, other.outcome
         assert (verdict.failed, verdict.is_tested) == (ours.failed, ours.is_tested)
         assert verdict.margin == pytest.approx(ours.margin, abs=1e-9)
@@ -49,11 +53,17 @@ def assert_alike(sumo: list[Episode], kinematic: list[Episode]) -> None:
 class TestACase:
     @pytest.mark.parametrize(
         ("scenario", "vut", "level"),
-        [("us23", "design1", 0), ("us23", "level2", 1), ("us23-traffic", "design2", 2)],
+        [
+            ("us23", "design1", 0),
+            ("us23", "level2", 1),
+            ("us23-traffic", "design2", 2),
+            ("us23-lane", "level0", 1),
+            ("us23-lane-traffic", "design2", 1),
+        ],
     )
     def test_ends_as_in_sumo(self, scenario, vut, level):
         road = named_scenario(scenario)
-        assert_alike(*by_both(plan_for(vut, scenario=road), uniform(200, level, road)))
+        assert_alike(*by_both(plan_for(vut, scenario=road), uniform(100, level, road)))
 
     @pytest.mark.parametrize("fail_when", ["unsafe", "brake_after_mps2 > 2", "after_gap_m < 3"])
     def test_is_judged_by_any_criterion(self, fail_when):

@@ -1,4 +1,4 @@
-"""Merging from an acceleration lane: merge requests, other cars, and the two lanes in SUMO."""
+"""Merging from an acceleration lane: merge requests, faults after a merge, and measures."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.scenario.case import Case
 from merge_sumo.scenario.scenario import DT_S, POV, US23, VUT, Scenario
 from merge_sumo.scenario.trajectory import End, Trajectory
-from merge_sumo.simulation.evaluate import simulate, simulate_part
+from merge_sumo.simulation.evaluate import simulate_part
 
 LANE = replace(US23, name="lane", lane_m=(-70.0, 130.0), follow_up_s=5.0)
 
@@ -25,16 +25,16 @@ LANE = replace(US23, name="lane", lane_m=(-70.0, 130.0), follow_up_s=5.0)
 class TestAMergeRequest:
     """It is granted on the lane, in the next step; at the end of the lane a merge is forced."""
 
-    def step(self, x_m: float, wish: int | None, scenario: Scenario = LANE) -> bool:
+    def step(self, x_m: float, merge_request: int | None, scenario: Scenario = LANE) -> bool:
         merging = Merging(1, scenario)
         merging.begin(0)
         state = np.array([[-500.0], [x_m]]), np.full((2, 1), 20.0)
-        wishes = None if wish is None else np.array([wish], dtype=np.int8)
-        merging.take(wishes, np.zeros((2, 1)), *state)
+        requests = None if merge_request is None else np.array([merge_request], dtype=np.int8)
+        merging.take(requests, np.zeros((2, 1)), *state)
         return bool(merging.step(*state)[0])
 
     @pytest.mark.parametrize(
-        ("x_m", "wish", "merged"),
+        ("x_m", "merge_request", "merged"),
         [
             (-72.1, MERGE, False),
             (-72.0, MERGE, True),
@@ -46,8 +46,8 @@ class TestAMergeRequest:
             (-2.0, None, True),
         ],
     )
-    def test_by_hand(self, x_m, wish, merged):
-        assert self.step(x_m, wish) is merged
+    def test_by_hand(self, x_m, merge_request, merged):
+        assert self.step(x_m, merge_request) is merged
 
     def test_that_never_comes_stops_before_the_end(self):
         merging = Merging(1, replace(LANE, lane_end="stop"))
@@ -63,22 +63,6 @@ class TestAMergeRequest:
         assert v_mps[VUT, 0] == pytest.approx(0.0, abs=1e-9)
         assert 128.0 < x_m[VUT, 0] < 130.0
         assert hardest >= -4.0 - 1e-9
-
-
-class TestSumo:
-    @pytest.mark.parametrize("scenario", ["us23-lane", "us23-lane-traffic"])
-    @pytest.mark.parametrize("vut", ["design2", "level0"])
-    def test_moves_as_the_equations(self, scenario, vut):
-        road, level = named_scenario(scenario), 1
-        plan, cases = plan_for(vut, scenario=road), uniform(60, level, road)
-        sumo, kinematic = simulate(plan, cases), simulate(plan.with_engine("kinematic"), cases)
-        for ours, theirs in zip(sumo, kinematic, strict=True):
-            one, other = ours.trajectory, theirs.trajectory
-            assert one.end is other.end is End.MERGED
-            np.testing.assert_allclose(one.motion, other.motion, rtol=0.0, atol=1e-9)
-            assert one.after is not None
-            assert other.after is not None
-            np.testing.assert_allclose(one.after, other.after, rtol=0.0, atol=1e-9)
 
 
 RAISING = """

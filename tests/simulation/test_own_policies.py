@@ -115,10 +115,8 @@ class TestAFolder:
         ("changed", "said"),
         [
             ({"0.bias": np.zeros(1)}, "0.bias is (1,)"),
-            ({"1.weight": np.zeros((1, ACTIONS, 8))}, "1.weight is (1, 7, 8)"),
             ({"1.weight": np.zeros((ACTIONS, 9))}, "1.weight is (7, 9)"),
             ({"0.weight": np.zeros((8, FEATURES), dtype=np.int64)}, "of int64"),
-            ({"0.weight": np.zeros((0, FEATURES)), "0.bias": np.zeros(0)}, "0.weight is (0, 26)"),
             ({"a_min_mps2": np.zeros((2, 2))}, "can only convert an array of size 1"),
             ({"a_min_mps2": np.zeros(1)}, "its limit of braking is not from -20 to below 0"),
             ({"2.weight": np.zeros((7, 7))}, "and not 0.weight, 0.bias, ..."),

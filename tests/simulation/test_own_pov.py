@@ -151,12 +151,9 @@ class TestACampaign:
         ("arguments", "said"),
         [
             (("--level", "own"), "--level own is a POV that you bring: name it with --pov"),
-            (("--level", "0", "--pov", "my_pov.py:Pov"), "--pov drives at --level own or all"),
-            (("--level", "3", "--pov", "my_pov.py:Pov"), "there is no POV level '3'"),
             (("--pov", "traci"), "a TraCI client drives the vehicle named vut and no other"),
             (("--pov", "level1"), "the POVs of levels 0 to 2 need no name"),
             (("--pov", "nowhere.py:Pov"), "the POV nowhere.py:Pov: cannot"),
-            (("--pov", "onnx:nowhere.onnx"), "the POV onnx:nowhere.onnx"),
         ],
     )
     def test_is_refused_in_one_sentence(self, call, arguments, said):
