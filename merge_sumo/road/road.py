@@ -93,7 +93,10 @@ class Piece:
 
 @dataclass(frozen=True, slots=True)
 class LanePath:
-    """The lanes that a vehicle drives on, in driving order.
+    """The lanes that a vehicle drives on.
+
+    Attributes:
+        pieces: the lanes in driving order, without gaps of the lane coordinate.
 
     Example:
         >>> path = road_of().ramp

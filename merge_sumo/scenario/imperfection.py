@@ -42,10 +42,13 @@ def check_amount(name: str, value: Amount, possible: Bounds) -> None:
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Imperfection:
-    """Base of `Sensing` and `Actuation`: numbers and ranges by name."""
+    """Base of `Sensing` and `Actuation`: numbers and ranges by name.
+
+    Attributes:
+        possible: lowest and highest possible number of each field.
+    """
 
     possible: ClassVar[dict[str, Bounds]]
-    """Lowest and highest possible number of each field."""
 
     def __post_init__(self) -> None:
         """Check the numbers.

@@ -62,11 +62,11 @@ INK = "0.1,0.1,0.1"
 
 
 @dataclass(frozen=True, slots=True)
-class Picture:
-    """The view of sumo-gui on the road.
+class View:
+    """The part of the road that the window of sumo-gui shows.
 
     Attributes:
-        zoom: SUMO's number for the zoom, in %.
+        zoom: zoom as SUMO counts it: at 100 the window shows the whole net.
         x_m: eastward coordinate of the middle in the net.
         y_m: northward coordinate of the middle in the net.
         width_m: width of the view on the road.
@@ -101,6 +101,11 @@ def write_scenario(folder: Path, road: Road, outcome: Outcome, trajectory: Traje
 
     Raises:
         UserError: something else is there, or the folder cannot be written.
+
+    Example:
+        >>> outcome, trajectory = run.outcomes[0], run.trajectory(0)
+        >>> write_scenario(Path("case"), road_for(run.scenario), outcome, trajectory)
+        PosixPath('case/replay.sumocfg')
     """
     road = _road_of_folder(road, folder)
     scenario = outcome.case.scenario.to_record() | {"net": None}
@@ -116,15 +121,15 @@ def _road_of_folder(road: Road, folder: Path) -> Road:
     identity = attrgetter("sha256", "mainline_edges", "ramp_edges")
     if identity(road) == identity(shipped):
         return shipped
-    fast = replace(road, mainline=_fast(road.mainline), ramp=_fast(road.ramp))
-    net = hosted_net(fast, 1, lane_goes_on=True)
-    return road_of_hosted(net, folder / HOSTED_NET, fast.lane_m)
+    mainline, ramp = _without_limit(road.mainline), _without_limit(road.ramp)
+    net = hosted_net(replace(road, mainline=mainline, ramp=ramp), 1, lane_goes_on=True)
+    return road_of_hosted(net, folder / HOSTED_NET, road.lane_m)
 
 
-def _fast(path: LanePath) -> LanePath:
-    """Return a path without a speed limit.
+def _without_limit(path: LanePath) -> LanePath:
+    """Return a path with a speed limit above all speeds.
 
-    SUMO lets a vehicle enter a replay no faster than its lane allows.
+    SUMO inserts a vehicle of a replay at most at the speed limit of its lane.
     """
     pieces = [replace(piece, speed_limit_mps=200.0) for piece in path.pieces]
     return LanePath(tuple(pieces))
@@ -182,12 +187,12 @@ def files_of(
         file, net = NET, shipped.path.read_bytes()
     else:
         file, net = HOSTED_NET, hosted_net(road, 1, lane_goes_on=True)
-    picture = _picture(road, record)
+    view = _view_of(road, record)
     roots = {
         TYPES: _types(trajectory),
-        LABELS: _labels(outcome, trajectory, picture),
+        LABELS: _labels(outcome, trajectory, view),
         RECORD: record,
-        VIEW: view_settings(picture),
+        VIEW: view_settings(view),
         CONFIG: _config(file, len(record)),
     }
     return {file: net} | {name: to_bytes(root) for name, root in roots.items()}
@@ -225,7 +230,7 @@ def motion_record(road: Road, trajectory: Trajectory) -> etree._Element:
             the lane of the mainline.
     """
     root = etree.Element("fcd-export")
-    rows = [*zip(trajectory.whole.tolist(), merged_rows(trajectory).tolist(), strict=True)]
+    rows = list(zip(trajectory.whole.tolist(), merged_rows(trajectory).tolist(), strict=True))
     rows += [rows[-1]] * HOLD_STEPS
     for step, (vehicles, merged) in enumerate(rows):
         timestep = etree.SubElement(root, "timestep", time=f"{step * DT_S:.2f}")
@@ -242,11 +247,11 @@ def motion_record(road: Road, trajectory: Trajectory) -> etree._Element:
     return root
 
 
-def view_settings(picture: Picture) -> etree._Element:
+def view_settings(view: View) -> etree._Element:
     """Return the settings of sumo-gui for a view.
 
     Args:
-        picture: the view.
+        view: the view.
     """
     root = etree.Element("viewsettings")
     scheme = etree.SubElement(root, "scheme", name="merge")
@@ -263,14 +268,14 @@ def view_settings(picture: Picture) -> etree._Element:
         poiText_bgColor=PALE,
     )
     etree.SubElement(scheme, "background", backgroundColor=PALE, showGrid="0")
-    x, y = f"{picture.x_m:g}", f"{picture.y_m:g}"
-    etree.SubElement(root, "viewport", zoom=picture.zoom, x=x, y=y)
+    x, y = f"{view.x_m:g}", f"{view.y_m:g}"
+    etree.SubElement(root, "viewport", zoom=view.zoom, x=x, y=y)
     etree.SubElement(root, "delay", value=REAL_TIME_MS)
     return root
 
 
-def _picture(road: Road, record: etree._Element) -> Picture:
-    """Return a view of the way of the VUT. A zoom of 100 shows the whole net."""
+def _view_of(road: Road, record: etree._Element) -> View:
+    """Return the view of all positions of the VUT in a record."""
     net = [(x, y) for path in (road.mainline, road.ramp) for _, x, y in path.corners()]
     driven = []
     for car in record.iterfind(f"timestep/vehicle[@id='{VEHICLES[VUT]}']"):
@@ -278,7 +283,7 @@ def _picture(road: Road, record: etree._Element) -> Picture:
     whole_m, _ = _box(net)
     driven_m, (x_m, y_m) = _box(driven)
     width_m = 1.3 * max(driven_m, 100.0)
-    return Picture(f"{100.0 * whole_m / width_m:.0f}", round(x_m), round(y_m), width_m)
+    return View(f"{100.0 * whole_m / width_m:.0f}", round(x_m), round(y_m), width_m)
 
 
 def _box(points: Sequence[tuple[float, float]]) -> tuple[float, FloatArray]:
@@ -306,7 +311,7 @@ def _config(net_file: str, timesteps: int) -> etree._Element:
         "gui-settings-file": VIEW,
         "start": "true",
         "delay": REAL_TIME_MS,
-        # It halts there: at its end it would show a dialog over the last picture.
+        # sumo-gui halts there. At the end it would show a dialog over the last picture.
         "breakpoints": f"{end_s - 2.0 * DT_S:.1f}",
         "window-size": "1280,800",
     }
@@ -316,19 +321,20 @@ def _config(net_file: str, timesteps: int) -> etree._Element:
     return root
 
 
-def _labels(outcome: Outcome, trajectory: Trajectory, picture: Picture) -> etree._Element:
+def _labels(outcome: Outcome, trajectory: Trajectory, view: View) -> etree._Element:
     """Return case, cause and legend as points of interest with a text."""
     words = cause(outcome, trajectory).removesuffix(".")
     if outcome.measures.end.is_error:
         words = words.partition(":")[0]  # without the message, which may hold anything
     lines = [case_line(outcome.case, outcome.index), *re.split(r"(?<=:) |\. ", words)]
     root = etree.Element("additional")
+    # Lines from the top of the view downwards, and the legend in a row below them.
     for number, line in enumerate(lines[:4]):
-        _label(root, f"line{number}", picture.place(0.0, 0.465 - 0.035 * number), line)
+        _label(root, f"line{number}", view.place(0.0, 0.465 - 0.035 * number), line)
     cars = VEHICLES[: outcome.case.scenario.vehicles]
     for number, name in enumerate(cars):
-        at = picture.place(0.13 * (number - 0.5 * (len(cars) - 1)), 0.315)
-        _label(root, name, at, NAMES[name], COLOURS[name], 0.012 * picture.width_m)
+        at = view.place(0.13 * (number - 0.5 * (len(cars) - 1)), 0.315)
+        _label(root, name, at, NAMES[name], COLOURS[name], 0.012 * view.width_m)
     return root
 
 
