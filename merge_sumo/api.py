@@ -56,7 +56,7 @@ from merge_sumo.campaigns.recorded import SETTINGS, RecordedCampaign, read_setti
 from merge_sumo.campaigns.scenario_suggestion import unseen
 from merge_sumo.campaigns.settings import CampaignSettings, settings_from_folder
 from merge_sumo.controllers.controller import Car, Seen
-from merge_sumo.controllers.in_memory import AnyVut, is_in_process, spec_of_driver
+from merge_sumo.controllers.in_memory import AnyVut, is_in_process
 from merge_sumo.controllers.parameters import Range
 from merge_sumo.controllers.python import SeenBatch
 from merge_sumo.drivers.policies import policies_in
@@ -444,13 +444,13 @@ def vuts(config: c.Vuts) -> Shown:
 @verb(c.CheckVut)
 def check_vut(config: c.CheckVut) -> vut_check.VutCheck:
     """Let a VUT drive a few cases and report its faults."""
-    spec = spec_of_driver(config.vut)
-    policies = None if config.policies is None else str(config.policies)
-    fields = {"vut": spec, "levels": (0,), "policies": policies, **c.non_defaults(config, c.Limits)}
     scenario = scenario_from(config.scenario or US23)
+    settings = CampaignSettings(scenario=scenario, levels=(0,), **named_settings(config))
     with Bars() as bars:
-        bars.say(f"{printable(spec)} drives a few cases: minutes, where a step takes seconds")
-        return vut_check.check_vut(CampaignSettings(scenario=scenario, **fields))
+        bars.say(
+            f"{printable(settings.vut)} drives a few cases: minutes, where a step takes seconds"
+        )
+        return vut_check.check_vut(settings)
 
 
 def scenarios() -> Shown:

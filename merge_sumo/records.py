@@ -217,12 +217,11 @@ def read_toml(path: Path, what: str) -> tuple[str, dict[str, Any]]:
     """
     try:
         text = read_limited(path, MAX_TOML_BYTES).decode()
+        return text, tomllib.loads(text)
     except OSError as error:
         raise UserError(f"cannot read the {what} {path}: {error.strerror}") from error
     except UnicodeDecodeError as error:
         raise UserError(f"the {what} {path} is not a text in UTF-8") from error
-    try:
-        return text, tomllib.loads(text)
     except (ValueError, RecursionError) as error:
         raise UserError(f"the {what} {path} is not TOML: {error}") from error
 

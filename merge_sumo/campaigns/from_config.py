@@ -42,7 +42,9 @@ def scenario_from(
     return replace(named, **values) if values else named
 
 
-def named_settings(config: c.Drivers, scenario: Scenario | None = None) -> dict[str, Any]:
+def named_settings(
+    config: c.Drivers | c.CheckVut, scenario: Scenario | None = None
+) -> dict[str, Any]:
     """Return the settings that a config names, by the fields of `CampaignSettings`.
 
     Args:

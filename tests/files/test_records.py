@@ -48,9 +48,7 @@ class Square(Record, frozen=True, tag_field="kind", tag="square"):
 
 WRONG = [
     ({"index": True}, "index is True: it must be a whole number"),
-    ({"index": 1.0}, "index is 1.0: it must be a whole number"),
     ({"speed_mps": "1"}, "speed_mps is '1': it must be a number"),
-    ({"speed_mps": True}, "speed_mps is True: it must be a number"),
     ({"speed_mps": 10**400}, "it must be finite"),
     ({"colour": "green"}, "colour is 'green': it must be one of red, blue"),
     ({"share": 2}, "share is 2: it must be a number of 0 or more, up to 1"),
