@@ -97,7 +97,7 @@ class ControllerProcess(ChildProcess):
     def close(self) -> None:
         """Let the controllers close, then end the process."""
         if self.alive:
-            with suppress(ProcessDiedError, UserError):
+            with suppress(UserError):
                 self.request(HostRequest("close"))
                 self.exit_code()
         self.kill()
@@ -198,7 +198,7 @@ class HostedKind(ControllerKind):
         except ProcessDiedError as died:
             if again and not died.hung:
                 return self.process(again=False)
-            raise ControllerError(str(died)) from died
+            raise
 
     def release(self) -> None:
         """End a process that no driver has taken."""
@@ -254,7 +254,7 @@ class HostedDriver(ControllerDriver):
             if not self._process.alive:
                 self._process = self._opened()
             reply = self._process.request(request)
-        except (ProcessDiedError, UserError) as error:
+        except UserError as error:
             raise ControllerDiedError(str(error)) from None
         self._files.update(paths_of(reply))
         self._reasons, self._signals = reply.reasons, {}
@@ -286,10 +286,7 @@ class HostedDriver(ControllerDriver):
         """Return a process in which the controllers are made."""
         process = self._kind.process()
         self._files.update(paths_of(process.loaded))
-        try:
-            self._parameters = process.make(self.corridors).parameters
-        except ProcessDiedError as died:
-            raise ControllerError(str(died)) from died
+        self._parameters = process.make(self.corridors).parameters
         return process
 
 

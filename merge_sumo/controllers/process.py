@@ -17,7 +17,7 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import IO, Any
 
-from merge_sumo.errors import UserError
+from merge_sumo.errors import ControllerError, UserError
 from merge_sumo.files import ScratchFolder
 from merge_sumo.limits import lower_limits
 from merge_sumo.printable import printable
@@ -178,8 +178,8 @@ BROKEN = "broke the channel to its process"
 """The reason of a process that closes its connection, or sends an invalid reply."""
 
 
-class ProcessDiedError(Exception):
-    """A child process has ended.
+class ProcessDiedError(ControllerError):
+    """The child process of a controller has ended.
 
     Attributes:
         hung: whether it was killed because it sent no reply in time.

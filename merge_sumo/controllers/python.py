@@ -66,7 +66,7 @@ def installed_vuts() -> dict[str, EntryPoint]:
     return vuts
 
 
-class OfPython(ControllerKind):
+class PythonObjectKind(ControllerKind):
     """A class, a function or an object that drives; a subclass finds it.
 
     Each corridor has an object of its own: a new one of a class, a copy of an object. An object
@@ -74,6 +74,9 @@ class OfPython(ControllerKind):
 
     A parameter is a keyword of the constructor, or of the function. A parameter that the
     constructor does not have is a numeric attribute of the object that is made.
+
+    Attributes:
+        is_function: whether it is a function, which has no state to reset.
     """
 
     asks_sumo = False
@@ -93,7 +96,7 @@ class OfPython(ControllerKind):
         self._is_batched = callable(getattr(target, "act_batch", None))
         acts = self._is_batched or callable(getattr(target, "act", None))
         if not acts and (self._is_class or not callable(target) or not fits(target, 1)):
-            raise self.refused(target)
+            raise self.not_a_vut(target)
         # An observation, or the number of corridors, is positional.
         positional = int(not self._is_class or self._is_batched)
         defaults = defaults_of(target, positional)
@@ -116,7 +119,7 @@ class OfPython(ControllerKind):
         """
         raise NotImplementedError
 
-    def refused(self, target: Any) -> UserError:
+    def not_a_vut(self, target: Any) -> UserError:
         """Return the error for a target that is not a VUT.
 
         Args:
@@ -139,7 +142,7 @@ class OfPython(ControllerKind):
             simulation: not used.
         """
         if self._is_batched:
-            return BatchedVut(corridors, self)
+            return BatchedDriver(corridors, self)
         return super().driver(corridors, simulation)
 
     def make(self, *corridors: int) -> Any:
@@ -160,7 +163,7 @@ class OfPython(ControllerKind):
             made = copy.deepcopy(target)  # of a class, itself
             if self._is_class:
                 made = target(*corridors, **self._keywords)
-            present = self.present(made)
+            present = self.parameters_of(made)
             for name, value in self._attributes.items():
                 if name not in present:
                     raise self.spec.unknown_parameter(name, present)
@@ -173,16 +176,16 @@ class OfPython(ControllerKind):
             raise UserError(f"{self.spec} cannot be {how}: {why}") from error
         return made
 
-    def present(self, made: Any) -> dict[str, float]:
-        """Return the parameters of a made object, or of the function, with their values.
+    def parameters_of(self, made: Any) -> dict[str, float]:
+        """Return the parameters of an object, by name, with their present values.
 
         Args:
-            made: what `make` returned.
+            made: an object that `make` returned.
         """
         return ({} if self.is_function else attributes_of(made)) | self._numbers
 
 
-class PythonKind(OfPython):
+class PythonKind(PythonObjectKind):
     """A class or a function of a module or a file: `module:Name` or `file.py:Name`."""
 
     form = "MODULE:NAME[?PARAMETER=VALUE&...] or FILE.py:NAME"
@@ -211,7 +214,7 @@ class PythonKind(OfPython):
         if target is None:
             raise UserError(f"{source} has no {name!r}: name a class or a function of it")
         if not is_code(target):
-            raise self.refused(target)
+            raise self.not_a_vut(target)
         if file := getattr(module, "__file__", None):
             self.code = (Path(file),)
         return target
@@ -228,7 +231,7 @@ class InstalledKind(PythonKind):
         return self.code_at(f"{entry.module}:{entry.attr}")
 
 
-class InProcessKind(OfPython):
+class InProcessKind(PythonObjectKind):
     """An object of this process, `here:NAME`, which drives in it."""
 
     files_are_known, max_workers = False, 1
@@ -259,7 +262,7 @@ class PythonController(Controller):
     has nothing to forget.
     """
 
-    def __init__(self, kind: OfPython) -> None:
+    def __init__(self, kind: PythonObjectKind) -> None:
         """Make the object.
 
         Args:
@@ -285,14 +288,14 @@ class PythonController(Controller):
 
     def parameters(self) -> Mapping[str, float]:
         """Return the parameters of the object."""
-        return self._kind.present(self._thing)
+        return self._kind.parameters_of(self._thing)
 
     def close(self) -> None:
         """Call `close`, if the object has it."""
         _close(self._thing)
 
 
-class BatchedVut(ControllerDriver):
+class BatchedDriver(ControllerDriver):
     """Drives by one object that acts in all corridors at once.
 
     The object is made with the number of corridors K. Its `act_batch(seen)` returns accelerations,
@@ -300,7 +303,7 @@ class BatchedVut(ControllerDriver):
     `reset(corridor, seen, seed)`, and `close()`.
     """
 
-    def __init__(self, corridors: int, kind: OfPython) -> None:
+    def __init__(self, corridors: int, kind: PythonObjectKind) -> None:
         """Make the object.
 
         Args:
@@ -382,7 +385,7 @@ class BatchedVut(ControllerDriver):
 
     def parameters(self) -> Mapping[str, float]:
         """Return the parameters of the object."""
-        return self._kind.present(self._object)
+        return self._kind.parameters_of(self._object)
 
     def close(self) -> None:
         """Call `close`, if the object has it."""

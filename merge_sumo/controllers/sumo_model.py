@@ -95,10 +95,10 @@ class SumoKind(ControllerKind):
         """
         if not isinstance(simulation, SumoSimulation):
             raise UserError(f"{self.spec} drives in a SUMO simulation only")
-        return SumoVut(corridors, simulation)
+        return SumoDriver(corridors, simulation)
 
 
-class SumoVut(Driver):
+class SumoDriver(Driver):
     """Answers the accelerations on which SUMO's models decide.
 
     In each step the models decide on a speed from the state, as in any SUMO simulation. For the VUT

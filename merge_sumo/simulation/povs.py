@@ -10,7 +10,7 @@ import numpy as np
 
 from merge_sumo.controllers.kinds import load
 from merge_sumo.controllers.spec import ControllerKind, ControllerOptions
-from merge_sumo.controllers.sumo_model import SumoVut
+from merge_sumo.controllers.sumo_model import SumoDriver
 from merge_sumo.drivers.base import ControllerDiedError, Driver, DriverWrapper, PovDiedError, Scene
 from merge_sumo.drivers.level0 import Level0Pov
 from merge_sumo.drivers.policies import (
@@ -193,9 +193,9 @@ class PovLibrary(Driver):
             self._drivers[level] = load_driver(POLICIES[level], corridors, povs.policies)
         if povs.own is not None:
             driver = povs.own.open(corridors, simulation)
-            if isinstance(driver, SumoVut):  # SUMO knows where its vehicles are
+            if isinstance(driver, SumoDriver):  # SUMO knows where its vehicles are
                 mainline = [row for row in range(driver.simulation.vehicles) if row != VUT]
-                self._drivers[OWN] = SumoVut(corridors, driver.simulation, mainline)
+                self._drivers[OWN] = SumoDriver(corridors, driver.simulation, mainline)
             else:
                 self._drivers[OWN] = PovAdapter(driver)
         self._level = np.zeros(corridors, dtype=np.int64)

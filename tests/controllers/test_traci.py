@@ -26,7 +26,7 @@ from support.vut_contract import cases_of, factory, run_cases, run_on
 
 from merge_sumo.controllers.spec import ControllerOptions, ControllerSpec
 from merge_sumo.controllers.traci import vut
-from merge_sumo.controllers.traci.vut import TraciKind, TraciVut
+from merge_sumo.controllers.traci.vut import TraciDriver, TraciKind
 from merge_sumo.drivers.base import Scene
 from merge_sumo.errors import UserError
 from merge_sumo.road.loader import road_of
@@ -53,7 +53,7 @@ class Played:
         thread.start()
         options = ControllerOptions(deadline_s=deadline_s, connect_s=10.0)
         kind = TraciKind(ControllerSpec("traci", str(self.port)), options)
-        driver = TraciVut(kind, road_of(), US23)
+        driver = TraciDriver(kind, road_of(), US23)
         try:
             for _ in range(episodes):
                 driver.begin(0, CASE)

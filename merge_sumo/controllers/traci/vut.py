@@ -113,10 +113,10 @@ class TraciKind(ControllerKind):
         """
         if not isinstance(simulation, SumoSimulation):
             raise UserError(f"{self.spec} drives in a SUMO simulation only")
-        return TraciVut(self, simulation.road, simulation.scenario)
+        return TraciDriver(self, simulation.road, simulation.scenario)
 
 
-class TraciVut(ControllerDriver):
+class TraciDriver(ControllerDriver):
     """Drives as a TraCI client commands; one client has one vehicle `vut`, so one corridor.
 
     Each `simulationStep` of the client is a step of the rollout. The speed that SUMO gives the VUT
@@ -223,7 +223,7 @@ class TraciVut(ControllerDriver):
         if wanted_mps is None:  # it is beyond the end of the net: it keeps its speed
             return 0.0
         if self._scenario.lane_m is not None and reply.by_sumo and not (merged or reply.merge):
-            # As `SumoVut` does: by eq. (4) SUMO's driver would come a little beyond the lane's end.
+            # As in `SumoDriver`: by eq. (4) SUMO's driver would come a little beyond the end.
             next_m = np.array(x_m[VUT] + v_mps[VUT] * DT_S)
             wanted_mps = min(wanted_mps, float(speed_to_stop_mps(next_m, self._scenario)))
         return float((wanted_mps - v_mps[VUT]) / DT_S)
@@ -311,9 +311,9 @@ class TraciVut(ControllerDriver):
     def _accept(self, patience_s: float) -> bool:
         """Return whether a client of this user connects; a program that ends is not waited for."""
         assert self._listener is not None, "listening"  # noqa: S101
+        self._listener.settimeout(LOOK_S)
         until = monotonic() + patience_s
         while True:
-            self._listener.settimeout(max(min(LOOK_S, until - monotonic()), 0.001))
             with suppress(OSError):
                 client, _ = self._listener.accept()
                 if not KNOWS_USERS or users_of(client) == {os.geteuid()}:
