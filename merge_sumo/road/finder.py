@@ -43,7 +43,7 @@ FARTHEST_M = 2e7
 SURROUNDINGS_M = 500.0
 """Distance to M up to which lanes next to the paths are drawn."""
 VISIBILITY = "visibility"
-"""Attribute of a connection: from how far its driver sees the others, in m."""
+"""Attribute of a connection: distance from which its driver sees the others, in m."""
 POINT_M = 1e-6
 """Length at which a lane is drawn that the file draws as a point."""
 NAME_LAST = "name the edge after the merge point as the last one of both"
@@ -181,7 +181,7 @@ class _Link(NamedTuple):
     state: str
     """SUMO's letter for the right of way: "M" goes first, "m" yields, "Z" is a zipper."""
     visibility_m: float | None
-    """From how far its driver sees the others; None where the net does not say so."""
+    """Distance from which its driver sees the others; None where the net does not say so."""
     connection: SumoConnection = None
 
 
@@ -215,10 +215,12 @@ def _road(
     for name in chain(*edges):
         _check_edge(road_net, name)
     own, tail = _split(*edges, edge_at_m)
+    # Forwards: the lanes that each path can reach, edge by edge, up to the first common one.
     layers = []
     for before in own:
         layers.append(_layers(net, before + tail, len(before)))
     meeting = _meeting(net, tail, layers)
+    # Backwards: the lanes that lead there, and forwards again those after it.
     main_link, ramp_link = meeting.links
     main = _lanes_before(layers[MAINLINE][: meeting.edge], main_link)
     ramp = _lanes_before(layers[RAMP][: meeting.edge], ramp_link)
@@ -231,6 +233,7 @@ def _road(
     else:
         begin_m, end_m = _window(lane, lane_m)
         onward = [*main_link.via, *onward]
+    # Lane coordinates: a path has its own lanes up to begin_m, those side by side up to end_m.
     placed = []
     for own_lanes, side_lanes in zip(apart, along, strict=True):
         pieces = _placed(own_lanes, begin_m - _length_m(own_lanes))
@@ -543,7 +546,7 @@ def _lanes_before(layers: list[_Layer], last: _Link) -> list[Piece]:
 
 
 def _onward(net: SumoNet, lane: SumoLane, edges: _Edges) -> list[Piece]:
-    """Return the lanes from one on along edges, as far as they go; it is on the first edge."""
+    """Return the longest sequence of lanes along edges that begins with a lane of the first one."""
     longest: list[Piece] = []
     links = _links(net, lane, edges[1]) if len(edges) > 1 else []
     for link in sorted(links, key=_swerve):

@@ -299,7 +299,8 @@ class Road:
             x_m: lane coordinate, in m.
             on_ramp: whether the path is the ramp.
         """
-        return (self.ramp if on_ramp else self.mainline).point(x_m)
+        path = self.ramp if on_ramp else self.mainline
+        return path.point(x_m)
 
     @property
     def speed_limit_mps(self) -> float:

@@ -147,7 +147,7 @@ class Case:
 
     @property
     def controller_seed(self) -> int:
-        """Seed for the controller, independent of the level and the orientation, unknown to it."""
+        """Seed for the controller, which knows neither level nor orientation, below 2**32."""
         return self._hashed([(float(x), float(v)) for x, v in self.starts()])
 
     def _hashed(self, known: object) -> int:
@@ -165,7 +165,7 @@ class Case:
                     f"{coordinate.field} belongs to a range of the scenario: give it there alone"
                 )
         if ranges:
-            # Checks the numbers.
+            # They are made of the numbers of the case, which may be impossible.
             _ = self.sensing, self.actuation
 
 
