@@ -160,12 +160,15 @@ def test_files_are_removed_and_renamed_in_one_module():
 
 
 def test_no_file_and_no_function_is_longer_than_a_reader_can_hold():
+    """Lines of docstrings of classes and functions do not count."""
     for module, file in MODULES.items():
-        assert len(file.read_text(encoding="utf-8").splitlines()) <= 700, module
-        for node in nodes_of(module, ast.FunctionDef, ast.AsyncFunctionDef):
+        rest = len(file.read_text(encoding="utf-8").splitlines())
+        for node in nodes_of(module, ast.ClassDef, ast.FunctionDef):
             docstring = len((ast.get_docstring(node) or "").splitlines())
+            rest -= docstring
             lines = node.end_lineno - node.lineno + 1 - docstring
-            assert lines <= 60, f"{module}.{node.name}"
+            assert isinstance(node, ast.ClassDef) or lines <= 60, f"{module}.{node.name}"
+        assert rest <= 650, module
 
 
 def test_no_two_classes_have_one_name():

@@ -77,11 +77,11 @@ class Sampler(ABC):
 
     Example:
         sampler = make_sampler("coverage", pool, seed=1)
-        while len(outcomes) < 300:
-            cases = sampler.ask(sampler.batch_size())
-            ran = simulate_cases(cases, first_index=len(outcomes))
-            sampler.tell(ran)
-            outcomes += ran
+        for batch in range(3):
+            outcomes = []
+            for index, episode in enumerate(simulate(plan, sampler.ask(15)), 15 * batch):
+                outcomes.append(episode.at(index, batch).outcome)
+            sampler.tell(outcomes)
     """
 
     about: ClassVar[str] = ""

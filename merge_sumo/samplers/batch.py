@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -49,8 +49,7 @@ def near_miss_limit(history: LevelHistory) -> float | None:
     return float(np.sort(np.abs(signed_gaps(history)))[NEAREST - 1])
 
 
-@dataclass(frozen=True, slots=True)
-class Proposal:
+class Proposal(NamedTuple):
     """A batch, the most valuable case first.
 
     Attributes:
@@ -65,9 +64,10 @@ class Proposal:
 def greedy(
     grid: CoverageGrid,
     points: FloatArray,
-    aim: FloatArray,
-    probability: FloatArray,
+    chance: FloatArray,
     n: int,
+    *,
+    aim: FloatArray | None = None,
     last: FloatArray | None = None,
 ) -> tuple[list[int], FloatArray]:
     """Choose candidates one by one, each with the most expected new coverage.
@@ -78,10 +78,10 @@ def greedy(
     Args:
         grid: coverage before the batch; changed in place.
         points: candidates, (m, d).
-        aim: worth of the ball of each candidate, (m,): P(fail), or that of a failure or near miss.
-        probability: P(fail) of each candidate, (m,).
+        chance: P(fail) of each candidate, (m,).
         n: number of picks.
-        last: worth that replaces `aim` for the last pick, (m,).
+        aim: worth of the ball of each candidate, (m,); P(fail) by default.
+        last: worth for the last pick, (m,); `aim` by default.
 
     Returns:
         Indices of the picks, and their expected new coverage in balls, (n,).
@@ -91,6 +91,8 @@ def greedy(
     free = np.ones(len(points), dtype=bool)
     balls = grid.balls(points)
     new = grid.new(balls)
+    if aim is None:
+        aim = chance
     for number in range(n):
         target = aim
         if last is not None and number == n - 1:
@@ -99,7 +101,7 @@ def greedy(
         best = int(np.argmax(worth))
         free[best] = False
         picks.append(best)
-        gains.append(float(probability[best] * new[best]))
+        gains.append(float(chance[best] * new[best]))
         grid.cover(balls[best], max(PICKED, float(aim[best])))
         near = np.linalg.norm(points - points[best], axis=1) <= grid.overlap
         new[near] = grid.new(balls[near])
@@ -144,7 +146,7 @@ class LevelSearch:
         self.surrogate = Surrogate(history) if len(history.points) >= 2 else None
         self._weight, self._rng = weight, rng
         self._grid = CoverageGrid(history.dims)
-        self._grid.cover(self._grid.balls(history.points[history.failed]), 1.0)
+        self._grid.cover(self._grid.balls(history.failing), 1.0)
         # A pending case is a pick of an earlier batch.
         for ball in self._grid.balls(pending):
             self._grid.cover(ball, PICKED)
@@ -178,9 +180,10 @@ class LevelSearch:
         screened = [anywhere(count, history.dims, rng)]
         if self.surrogate is not None:
             screened.append(between(self.surrogate, 200, rng))
-        failing = history.points[history.failed]
-        if len(failing):
-            screened.append(around(failing, 300, LOCAL_REACH * radius_for(history.dims), rng))
+        if len(history.failing):
+            screened.append(
+                around(history.failing, 300, LOCAL_REACH * radius_for(history.dims), rng)
+            )
         return np.concatenate(screened)
 
     def shortlist(self, screened: FloatArray, gaps: FloatArray, n: int) -> FloatArray:
@@ -225,7 +228,7 @@ class LevelSearch:
         Returns:
             Candidates, (60, d).
         """
-        picks, _ = greedy(self._grid.copy(), self.points, self.chance, self.chance, n)
+        picks, _ = greedy(self._grid.copy(), self.points, self.chance, n)
         best = self._ranked(self.points, self.chance, n)
         centres = self.points[np.concatenate([best, picks])]
         return around(centres, 60, REFINED_REACH * radius_for(self.history.dims), self._rng)
@@ -242,13 +245,9 @@ class LevelSearch:
             self._grid.cover(self._grid.balls(spread), PICKED)
         # The last case of a batch of five and more is the most informative one.
         last = disagreement(self.gaps) if n >= 5 else None
-        picks, gain = greedy(
-            self._grid, self.points, self.chance, self.chance, n - len(spread), last
-        )
-        return Proposal(
-            np.concatenate([spread, self.points[picks]]),
-            np.concatenate([np.ones(len(spread)), gain]),
-        )
+        picks, gain = greedy(self._grid, self.points, self.chance, n - len(spread), last=last)
+        points = np.concatenate([spread, self.points[picks]])
+        return Proposal(points, np.concatenate([np.ones(len(spread)), gain]))
 
     def surrogate_batch(self, n: int) -> Proposal:
         """Choose a batch by the surrogate alone.
@@ -269,7 +268,7 @@ class LevelSearch:
         shortlist = self._ranked(points, aim, max(2000, n))
         points, aim = points[shortlist], aim[shortlist]
         chance = aim if limit is None else surrogate.predict(points)
-        picks, gain = greedy(self._grid, points, aim, chance, n)
+        picks, gain = greedy(self._grid, points, chance, n, aim=aim)
         return Proposal(points[picks], gain)
 
     def _ranked(self, points: FloatArray, chance: FloatArray, most: int) -> IntArray:

@@ -28,7 +28,7 @@ def surrogate_candidates(surrogate: Surrogate, n: int, rng: np.random.Generator)
         Points, (m, d), more than `n`.
     """
     history = surrogate.history
-    centres = history.points[history.failed]
+    centres = history.failing
     if not len(centres):
         # The worst cases stand in for failures.
         centres = history.points[np.argsort(history.margin, kind="stable")[:20]]

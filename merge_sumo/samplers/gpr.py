@@ -104,7 +104,7 @@ class _Posterior:
         first = len(queries)
         queries = np.concatenate([queries, pending])
         self._queries = queries
-        failures = history.points[history.failed]
+        failures = history.failing
         # The most cases to learn from: they bound the time for a batch in a long campaign.
         history = most_informative(history, 600)
         process = _fit(history)

@@ -38,7 +38,7 @@ class LevelHistory:
 
     Example:
         history = sampler.history(level=1)
-        failing = history.points[history.failed]
+        chance = len(history.failing) / len(history.points)
 
     Attributes:
         points: cases in the unit cube, (N, d).
@@ -67,6 +67,11 @@ class LevelHistory:
     def dims(self) -> int:
         """Number of coordinates of a case, d."""
         return int(self.points.shape[1])
+
+    @property
+    def failing(self) -> FloatArray:
+        """Cases that failed, (m, d)."""
+        return self.points[self.failed]
 
 
 def most_informative(history: LevelHistory, most: int) -> LevelHistory:

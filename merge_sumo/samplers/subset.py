@@ -6,7 +6,7 @@ failures; each region's chains start from the lowest margins of the last one.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -21,8 +21,7 @@ STAGE_SIZE = 100
 SEED_SHARE = 0.2
 
 
-@dataclass(frozen=True, slots=True)
-class SubsetState:
+class SubsetState(NamedTuple):
     """The state of subset simulation after a history.
 
     Attributes:

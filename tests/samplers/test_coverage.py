@@ -85,7 +85,7 @@ class TestCoverageGrid:
     def test_a_greedy_batch_maximises_the_expected_gain_pick_by_pick(self, dims):
         rng = np.random.default_rng(dims)
         points, chance = 0.3 * rng.random((100, dims)), rng.random(100)
-        picks, gains = greedy(CoverageGrid(dims), points, chance, chance, 20)
+        picks, gains = greedy(CoverageGrid(dims), points, chance, 20)
         grid, free = CoverageGrid(dims), np.ones(100)
         balls = grid.balls(points)
         for pick, gain in zip(picks, gains, strict=True):
