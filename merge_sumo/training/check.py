@@ -8,18 +8,13 @@ from pathlib import Path
 
 import numpy as np
 
-from merge_sumo.controllers.kinds import load
-from merge_sumo.controllers.spec import ControllerOptions
+from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.drivers.policies import load_network
-from merge_sumo.metrics.criterion import Criterion
 from merge_sumo.metrics.paper import is_close
-from merge_sumo.road.loader import road_for
 from merge_sumo.scenario.case import Case, from_unit
 from merge_sumo.scenario.scenario import SVO, Scenario
 from merge_sumo.scenario.trajectory import End, Trajectory
 from merge_sumo.simulation.evaluate import simulate_part
-from merge_sumo.simulation.plan import SimulationPlan
-from merge_sumo.simulation.povs import Povs
 from merge_sumo.training.best_response import beam_search, best_response
 from merge_sumo.training.game import Game, greedy, of_two
 from merge_sumo.training.reward import Reward, RewardParts, Role
@@ -61,9 +56,9 @@ class PolicyCheck:
         mean_level0: mean return of level-0 behaviour in place of the driver.
         mean_regret: mean of best - return, as a share of the mean gain of the best response over
             level-0 behaviour.
-        p99_regret: 99th percentile of the same.
+        p99_regret: 99th percentile of the regret, as a share of the same mean gain.
         collisions: number of collisions.
-        avoidable_collisions: those in cases where the best response has none.
+        avoidable_collisions: collisions in cases where the best response has none.
     """
 
     cases: int
@@ -77,9 +72,16 @@ class PolicyCheck:
 
 
 def returns_of(trajectories: list[Trajectory], reward: Reward) -> RewardParts:
-    """Return the reward parts of episodes that were played in SUMO.
+    """Compute the reward parts of n episodes that were played in SUMO.
 
     The accelerations that count are the commanded ones; at a stand, those that were possible.
+
+    Args:
+        trajectories: motions of the episodes.
+        reward: the reward of their scenario.
+
+    Returns:
+        The parts, (n,) each.
     """
     parts = np.zeros((3, len(trajectories)))
     for n, trajectory in enumerate(trajectories):
@@ -158,15 +160,11 @@ def _play(cases: list[Case], name: str, agent: str, folder: Path) -> list[Trajec
     role, opponent = OPPONENTS[name]
     pov, vut = (agent, opponent) if role == "pov" else (opponent, agent)
     scenario, level = cases[0].scenario, int(pov[-1])
-    plan = SimulationPlan(
-        scenario=scenario,
-        road=road_for(scenario),
-        vut=load(f"level{vut[-1]}", ControllerOptions(policies=folder)),
-        povs=Povs(policies=folder),
-        criterion=Criterion(),
+    settings = CampaignSettings(
+        vut=f"level{vut[-1]}", levels=(level,), scenario=scenario, policies=str(folder)
     )
     played = []
     for case in cases:
         svo_rad = case.svo_rad if level == 2 else None
         played.append(replace(case, level=level, svo_rad=svo_rad))
-    return simulate_part(plan, played, attrgetter("trajectory"))
+    return simulate_part(settings.load_plan(), played, attrgetter("trajectory"))

@@ -26,19 +26,31 @@ that a vehicle on the level-0 profile drives in 1.6 s."""
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class RewardWeights:
-    """Weights W, by default of the paper's scenario; `policies/README.md` tells of their origin."""
+    """Weights W, by default of the paper's scenario; `policies/README.md` tells of their origin.
 
-    pov_acc: float = 0.1  # per s and (m/s2)^2
-    pov_v_hw: float = 0.1  # per s and m/s outside the speeds that the mainline drives at
-    vut_acc: float = 0.15  # per s and (m/s2)^2
-    vut_v_min: float = 0.1  # per s and m/s below the speed at which the VUT is slow
-    vut_v_end: float = 1.5  # once, per m/s outside the mainline's speeds at t1
-    ttc: float = 0.2  # once, for TTC = 0; falls linearly to 0 where it is no longer short
-    gap: float = 1.0  # once, the reward of |dx| >= `gap_full_m`; grows linearly from 0 at dx = 0
-    gap_full_m: float = 60.0  # |dx| from which the reward of a gap is full
+    Attributes:
+        pov_acc: cost of the POV's acceleration, per s and (m/s2)^2.
+        pov_v_hw: cost of the POV's speed, per s and m/s outside the speeds of the mainline.
+        vut_acc: cost of the VUT's acceleration, per s and (m/s2)^2.
+        vut_v_min: cost of a slow VUT, per s and m/s below `v_min_mps`.
+        vut_v_end: cost of the VUT's speed at t1, once, per m/s outside the speeds of the mainline.
+        ttc: cost of TTC = 0 at t1, once; it falls linearly to 0 at `ttc_min_s`.
+        gap: reward of a full gap at t1, once; it grows linearly from 0 at dx = 0.
+        gap_full_m: |dx| from which a gap is full.
+        critical: cost of dx = 0 at t1, once; it falls linearly to 0 at `dx_critical_m`.
+        crash: cost of a collision, once.
+    """
+
+    pov_acc: float = 0.1
+    pov_v_hw: float = 0.1
+    vut_acc: float = 0.15
+    vut_v_min: float = 0.1
+    vut_v_end: float = 1.5
+    ttc: float = 0.2
+    gap: float = 1.0
+    gap_full_m: float = 60.0
     critical: float = 0.5
-    """Once, for dx = 0; falls linearly to 0 where the gap is no longer critical."""
-    crash: float = 20.0  # once, for a collision
+    crash: float = 20.0
 
     @classmethod
     def of(cls, scenario: Scenario) -> Self:
@@ -47,6 +59,9 @@ class RewardWeights:
         The cost of a second of acceleration, or of a wrong speed, is a share of the length of the
         game; accelerations count as shares of the hardest, speeds as shares of that of the VUT at
         M. The cost of a crash and the reward of a gap are the same everywhere.
+
+        Args:
+            scenario: the scenario.
         """
         unit, paper = Units.of(scenario), cls()
         acceleration = unit.acceleration * unit.acceleration * unit.time
@@ -63,14 +78,25 @@ class RewardWeights:
 
 @dataclass(frozen=True, slots=True)
 class RewardParts:
-    """Rewards in their three parts, (K,) each; psi, a social value orientation, mixes them."""
+    """Rewards in their three parts, which psi, a social value orientation, mixes.
+
+    Attributes:
+        safe: safety of both vehicles, (K,).
+        pov_ego: comfort and speed of the POV, (K,).
+        vut_ego: comfort and speed of the VUT, (K,).
+    """
 
     safe: FloatArray
     pov_ego: FloatArray
     vut_ego: FloatArray
 
     def of(self, role: Role, svo_rad: FloatArray) -> FloatArray:
-        """Return the agent's reward, (K,); `svo_rad` is psi of the POV."""
+        """Return the reward of an agent, (K,).
+
+        Args:
+            role: vehicle of the agent, "pov" or "vut".
+            svo_rad: psi of the POV, (K,).
+        """
         if role == "vut":
             return self.safe + self.vut_ego
         return self.safe + self.pov_ego * np.cos(svo_rad) + self.vut_ego * np.sin(svo_rad)
@@ -85,6 +111,10 @@ class Reward:
     Example:
         reward = Reward.of(US23)
         cost = reward.pov_step(v_pov_mps, a_pov_mps2)
+
+    Attributes:
+        weights: the weights.
+        scenario: gives the limits of the terms.
     """
 
     weights: RewardWeights
@@ -92,49 +122,82 @@ class Reward:
 
     @classmethod
     def of(cls, scenario: Scenario) -> Self:
-        """Return the reward of a scenario with the weights that it is trained with."""
+        """Return the reward of a scenario with the weights that its drivers are trained with.
+
+        Args:
+            scenario: the scenario.
+        """
         return cls(RewardWeights.of(scenario), scenario)
 
     def phi_v_hw(self, v_mps: FloatArray) -> FloatArray:
-        """Return minus the m/s by which a speed is outside the mainline's range.
+        """Return minus the m/s by which a speed is outside the speeds of the mainline.
 
-        The speed of the POV, and the VUT's at t1.
+        Args:
+            v_mps: speeds of the POV, or of the VUT at t1.
         """
         below, above = self.scenario.v_hw_min_mps - v_mps, v_mps - self.scenario.v_hw_max_mps
         return -np.maximum(np.maximum(below, above), 0.0)
 
     def phi_ttc(self, dx_m: FloatArray, dv_mps: FloatArray) -> FloatArray:
-        """Return -(1 - TTC / limit) for a TTC below the scenario's limit, else 0."""
+        """Return -(1 - TTC / limit) for a TTC below the limit of the scenario, else 0.
+
+        Args:
+            dx_m: positions of the POV less those of the VUT.
+            dv_mps: speeds of the POV less those of the VUT.
+        """
         closing = dx_m * dv_mps < 0.0
         ttc_s = np.abs(dx_m) / np.where(closing, np.abs(dv_mps), 1.0)
         short = np.maximum(1.0 - ttc_s / self.scenario.ttc_min_s, 0.0)
         return -np.where(closing, short, 0.0)
 
     def phi_dx(self, dx_m: FloatArray) -> FloatArray:
-        """Return the reward of a wide gap less the penalty of a critical one, both weighted."""
+        """Return the reward of a wide gap less the penalty of a critical one, both weighted.
+
+        Args:
+            dx_m: positions of the POV less those of the VUT.
+        """
         gap, weights = np.abs(dx_m), self.weights
         wide = np.minimum(gap / weights.gap_full_m, 1.0)
         near = np.maximum(1.0 - gap / self.scenario.dx_critical_m, 0.0)
         return weights.gap * wide - weights.critical * near
 
     def safety(self, dx_m: FloatArray, dv_mps: FloatArray) -> FloatArray:
-        """Return the safety reward of both vehicles at t1."""
+        """Return the safety reward of both vehicles at t1.
+
+        Args:
+            dx_m: positions of the POV less those of the VUT.
+            dv_mps: speeds of the POV less those of the VUT.
+        """
         crash = -(np.abs(dx_m) < self.scenario.dx_crash_m).astype(np.float64)
         near = self.weights.ttc * self.phi_ttc(dx_m, dv_mps) + self.phi_dx(dx_m)
         return near + self.weights.crash * crash
 
     def pov_step(self, v_pov_mps: FloatArray, a_pov_mps2: FloatArray) -> FloatArray:
-        """Return the POV's ego reward of one 0.1 s step."""
+        """Return the POV's ego reward of one step of 0.1 s.
+
+        Args:
+            v_pov_mps: its speed at the start of the step.
+            a_pov_mps2: its commanded acceleration.
+        """
         weights = self.weights
         speed = weights.pov_v_hw * self.phi_v_hw(v_pov_mps)
         return (weights.pov_acc * -np.square(a_pov_mps2) + speed) * DT_S
 
     def vut_step(self, v_vut_mps: FloatArray, a_vut_mps2: FloatArray) -> FloatArray:
-        """Return the VUT's running ego reward of one 0.1 s step."""
+        """Return the VUT's running ego reward of one step of 0.1 s.
+
+        Args:
+            v_vut_mps: its speed at the start of the step.
+            a_vut_mps2: its commanded acceleration.
+        """
         weights = self.weights
         speed = weights.vut_v_min * -np.maximum(self.scenario.v_min_mps - v_vut_mps, 0.0)
         return (weights.vut_acc * -np.square(a_vut_mps2) + speed) * DT_S
 
     def vut_end(self, v_vut_mps: FloatArray) -> FloatArray:
-        """Return the VUT's ego reward of its final speed, at t1."""
+        """Return the VUT's ego reward of its final speed, at t1.
+
+        Args:
+            v_vut_mps: its speed at t1.
+        """
         return self.weights.vut_v_end * self.phi_v_hw(v_vut_mps)
