@@ -10,6 +10,7 @@ from collections.abc import Callable, Container, Iterable, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from functools import cached_property
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -353,8 +354,8 @@ def compare(runs: Sequence[RecordedCampaign]) -> Comparison:
     if not versions[0].summary.levels.keys() & versions[1].summary.levels.keys():
         raise UserError(f"{runs[0].folder} and {runs[1].folder} have no POV level in common")
     changes = []
-    for number in range(2, len(versions) + 1):
-        changes.append(_version_change(number, *versions[number - 2 : number]))
+    for number, (earlier, later) in enumerate(pairwise(versions), start=2):
+        changes.append(_version_change(number, earlier, later))
     notes = []
     if len({(run.settings.sampler, run.settings.cases) for run in runs}) > 1:
         notes.append(

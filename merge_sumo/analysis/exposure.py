@@ -66,44 +66,39 @@ class _Shape(Record, frozen=True):
         below, up_to = self.law(low, high).cdf([low, high]).tolist()
         return below, up_to
 
-    def quantiles(self, d: Coordinate, chances: FloatArray) -> FloatArray:
+    def quantiles(self, coordinate: Coordinate, chances: FloatArray) -> FloatArray:
         """Return values of a coordinate, (n,), in its unit.
 
         Args:
-            d: the coordinate.
+            coordinate: the coordinate.
             chances: probabilities to be below the values, (n,).
         """
-        low, high = self.bounds(d)
-        below, up_to = self.ends(low, high)
+        low, high, below, up_to = self.cut(coordinate)
         values = self.law(low, high).ppf(below + chances * (up_to - below))
         return np.clip(np.asarray(values, dtype=np.float64), low, high)
 
-    def bounds(self, d: Coordinate) -> tuple[float, float]:
-        """Return the bounds at which it is cut off, in the unit of a coordinate.
+    def cut(self, coordinate: Coordinate) -> tuple[float, float, float, float]:
+        """Return the bounds at which it is cut off, and the probabilities to be below each.
 
         Args:
-            d: the coordinate.
-        """
-        return d.low if self.low is None else self.low, d.high if self.high is None else self.high
-
-    def check(self, d: Coordinate) -> None:
-        """Check that the distribution is within the pool.
-
-        Args:
-            d: the coordinate.
+            coordinate: the coordinate, with the bounds of the pool.
 
         Raises:
-            UserError: where it is not, or has no probability there.
+            UserError: where the bounds are not within the pool, or no values are between them.
         """
-        low, high = self.bounds(d)
-        if not d.low <= low < high <= d.high:
+        low = coordinate.low if self.low is None else self.low
+        high = coordinate.high if self.high is None else self.high
+        if not coordinate.low <= low < high <= coordinate.high:
             raise UserError(
-                f"{d.field}: low is {low:g} and high {high:g}: choose low < high within the pool, "
-                f"{d.low:g} to {d.high:g}"
+                f"{coordinate.field}: low is {low:g} and high {high:g}: choose low < high within "
+                f"the pool, {coordinate.low:g} to {coordinate.high:g}"
             )
         below, up_to = self.ends(low, high)
         if not up_to - below > LEAST_INSIDE:
-            raise UserError(f"{d.field}: such a distribution has no values within the pool")
+            raise UserError(
+                f"{coordinate.field}: such a distribution has no values within the pool"
+            )
+        return low, high, below, up_to
 
 
 class Uniform(_Shape, frozen=True, tag_field="kind", tag="uniform"):
@@ -244,7 +239,7 @@ def read_distribution(
         content = kind() if path is None else decode(Path(path).read_bytes(), kind)
         for d in coordinates:
             marginals[d.field] = getattr(content, d.field)
-            marginals[d.field].check(d)
+            marginals[d.field].cut(d)  # which raises for a wrong one
         weights = content.levels or even
         if not weights.keys() <= even.keys():
             known = ", ".join(sorted(even))

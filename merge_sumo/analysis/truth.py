@@ -116,12 +116,8 @@ class Truth:
         """Return the points, (m, d), of each region with at least `REAL_REGION` of the failures."""
         points = self.failures
         labels = regions(points)
-        found = []
-        for label in np.unique(labels):
-            group = points[labels == label]
-            if len(group) >= REAL_REGION * len(points):
-                found.append(group)
-        return found
+        real = np.flatnonzero(np.bincount(labels) >= REAL_REGION * len(points))
+        return [points[labels == label] for label in real]
 
 
 def ground_truth(
