@@ -80,8 +80,6 @@ def load_libsumo() -> Any:
     try:
         libsumo = importlib.import_module("libsumo")
     except ModuleNotFoundError as error:
-        if error.name != "libsumo":
-            raise
         raise UserError(
             f"libsumo is not installed: run `pip install libsumo=={SUMO_VERSION}`"
         ) from error

@@ -31,7 +31,6 @@ from merge_sumo.scenario.scenario import (
     DT_S,
     MAX_EPISODE_S,
     MAX_FOLLOW_UP_S,
-    US23,
     VEHICLES,
     VUT,
     Scenario,
@@ -237,8 +236,8 @@ def _read(folder: Path) -> _Episode:
 def _outcome(path: Path) -> Outcome:
     record: Any = read_record(path, dict[str, Any])
     try:
-        written = record.pop(SCENARIO, None)  # folders of older versions have none
-        scenario = US23 if written is None else convert(written, Scenario)
+        # Folders of older versions have none: they are of the paper's, which is the default.
+        scenario = convert(record.pop(SCENARIO, {}), Scenario)
         return Outcome.from_json(to_json(record), scenario)
     except UserError as error:
         raise UserError(f"{path} is not the case of a replay: {error}") from error
