@@ -481,11 +481,10 @@ class Measures:
         return max(0.0, -float(after[:, brakes, 2].min(initial=0.0)))
 
     def _after(self) -> tuple[FloatArray, FloatArray]:
-        """Return bumper gaps and closing speeds in the follow-up, (T, A - 1) each."""
-        motion = (
-            self.trajectory.motion[:0] if self.trajectory.after is None else self.trajectory.after
-        )
-        return gaps_m(motion, self.trajectory.case.scenario.lengths_m)
+        """Return bumper gaps and closing speeds in the follow-up, (T, A - 1); else no rows."""
+        after = self.trajectory.after
+        rows = self.trajectory.motion[:0] if after is None else after
+        return gaps_m(rows, self.trajectory.case.scenario.lengths_m)
 
     @measure(label="place of the merge", column="merges at", missing=math.inf, only_with=LANE)
     def x_merge_m(self) -> float | None:
