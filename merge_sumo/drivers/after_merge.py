@@ -56,10 +56,8 @@ class PovAfterMerge(DriverWrapper):
         merged = np.zeros(self.corridors, np.bool_) if scene.merged is None else scene.merged
         x_pov, v_pov, x_vut, v_vut = scene.x_pov_m, scene.v_pov_mps, scene.x_vut_m, scene.v_vut_mps
         after_m = ~merged & ~self._is_own & (x_vut >= 0.0)
-        seen = scene
-        if after_m.any():
-            _, end_m = self.scenario.lane_m or (0.0, 0.0)
-            seen = scene._replace(x_m=scene.x_m - np.where(after_m, end_m, 0.0))
+        _, end_m = self.scenario.lane_m or (0.0, 0.0)
+        seen = scene._replace(x_m=scene.x_m - np.where(after_m, end_m, 0.0))
         answer = self._driver.act(seen)
         recovery = np.clip((self._v_first_mps - v_pov) / DT_S, 0.0, 1.0)
         passed = after_m & (x_pov - self.scenario.pov_length_m > x_vut)

@@ -13,14 +13,14 @@ from merge_sumo.drivers.car_following import acc_mps2, car_ahead
 from merge_sumo.drivers.level0 import Level0Vut
 from merge_sumo.errors import UserError
 from merge_sumo.scenario.case import Case, FloatArray
-from merge_sumo.scenario.scenario import DT_S, VUT
+from merge_sumo.scenario.scenario import BEHIND, DT_S, VUT
 
 END_MARGIN_M = 1.0
 """Distance before the end of the lane at which it stops."""
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)
-class GapChoice(Design):
+class GapChoiceDesign(Design):
     """Parameters of a VUT that chooses a gap.
 
     Attributes:
@@ -37,7 +37,7 @@ class GapChoice(Design):
             raise UserError("brake_mps2 is 0: choose a number above 0, so that the VUT stops")
 
 
-HEADWAY = GapChoice()
+DESIGN = GapChoiceDesign()
 
 
 class GapChoiceVut(Level0Vut):
@@ -49,14 +49,25 @@ class GapChoiceVut(Level0Vut):
     `brake_mps2` stops it before the end of the lane, and waits there. On the mainline it drives the
     level-0 profile, and follows the car ahead no closer than ACC. Without a lane it is the level-0
     VUT.
+
+    Example:
+        driver = GapChoiceVut(corridors=1, design=GapChoiceDesign(headway_s=1.2))
+
+    Attributes:
+        design: the parameters.
     """
 
-    def __init__(self, corridors: int, choice: GapChoice = HEADWAY) -> None:
-        """Prepare a controller with these parameters for each corridor."""
+    def __init__(self, corridors: int, design: GapChoiceDesign = DESIGN) -> None:
+        """Begin without requests in all corridors.
+
+        Args:
+            corridors: number of corridors, K.
+            design: the parameters.
+        """
         super().__init__(corridors)
-        self.choice = choice
-        self._before_mps: FloatArray | None = None
-        """Speeds of all vehicles a step ago, (A, K)."""
+        self.design = design
+        self._before_mps = np.zeros((BEHIND + 1, corridors))
+        """Speeds of the vehicles a step ago, by row and corridor."""
 
     def begin(self, corridor: int, case: Case) -> None:
         """Take the speeds at the start of a case.
@@ -66,8 +77,8 @@ class GapChoiceVut(Level0Vut):
             case: the case of the next episode.
         """
         super().begin(corridor, case)
-        if self._before_mps is not None:
-            self._before_mps[:, corridor] = [v_mps for _, v_mps in case.starts()]
+        for row, (_, v_mps) in enumerate(case.starts()):
+            self._before_mps[row, corridor] = v_mps
 
     def act(self, scene: Scene) -> FloatArray:
         """Return the acceleration in each corridor, (K,), and make the merge requests.
@@ -85,15 +96,15 @@ class GapChoiceVut(Level0Vut):
         merges = on_lane & (next_m[VUT] >= begin_m) & self._accepts(next_m, scene.v_mps)
         stays = on_lane & ~merges
         self._merge_requests = np.select([merges, stays], [MERGE, STAY], NO_REQUEST).astype(np.int8)
-        stopping = stopping_mps(end_m - END_MARGIN_M - next_m[VUT], self.choice.brake_mps2)
+        stopping = stopping_mps(end_m - END_MARGIN_M - next_m[VUT], self.design.brake_mps2)
         slower = np.minimum(answer, (stopping - scene.v_vut_mps) / DT_S)
         follows = np.minimum(answer, self._following_mps2(scene))
-        self._before_mps = scene.v_mps.copy()
+        self._before_mps[: len(scene.v_mps)] = scene.v_mps
         return np.where(stays, slower, follows)
 
     def _accepts(self, x_m: FloatArray, v_mps: FloatArray) -> NDArray[np.bool_]:
         """Return whether both time gaps suffice in states, (A, K): (K,)."""
-        headway_s = self.choice.headway_s
+        headway_s = self.design.headway_s
         ahead = x_m - self.scenario.pov_length_m - x_m[VUT] >= headway_s * v_mps[VUT]
         behind = x_m[VUT] - self.scenario.vut_length_m - x_m >= headway_s * v_mps
         suffices = np.where(x_m >= x_m[VUT], ahead, behind)
@@ -103,9 +114,8 @@ class GapChoiceVut(Level0Vut):
     def _following_mps2(self, scene: Scene) -> FloatArray:
         """Return the acceleration of ACC behind the car ahead, (K,)."""
         ahead_m, leader = car_ahead(scene.x_m)
-        before = scene.v_mps if self._before_mps is None else self._before_mps
         v_leader = scene.v_mps[leader]
-        a_leader = (v_leader - before[leader]) / DT_S
+        a_leader = (v_leader - self._before_mps[leader]) / DT_S
         is_free = np.isinf(ahead_m)
         gap_m = np.where(is_free, 1e6, ahead_m) - self.scenario.pov_length_m
         v_desired = self.scenario.level0_v_mps
@@ -113,4 +123,4 @@ class GapChoiceVut(Level0Vut):
         return np.where(is_free, np.inf, following)
 
 
-VUTS = {"gap": BuiltInVut(GapChoiceVut, HEADWAY, ramp_only=True)}
+VUTS = {"gap": BuiltInVut(GapChoiceVut, DESIGN, ramp_only=True)}

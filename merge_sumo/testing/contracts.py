@@ -41,7 +41,11 @@ __all__ = [
 
 
 def episode(case: Case) -> Trajectory:
-    """Return an episode without SUMO: every vehicle keeps its speed until the VUT is at M."""
+    """Return an episode without SUMO: every vehicle keeps its speed until the VUT is at M.
+
+    Args:
+        case: the case; its VUT moves.
+    """
     starts = np.array(case.starts())  # (A, 2) of x and v
     steps = int(np.ceil(-starts[VUT, 0] / (starts[VUT, 1] * DT_S)))
     time_s = np.arange(steps + 1)[:, None] * DT_S
@@ -51,6 +55,10 @@ def episode(case: Case) -> Trajectory:
 
 class MeasureContract:
     """Contract of a measure: a pure function of an episode.
+
+    Example:
+        class TestMyMeasure(MeasureContract):
+            measure = MY_MEASURE
 
     Attributes:
         measure: the measure under test.
@@ -96,7 +104,12 @@ _kept: list[ScratchFolder] = []
 
 @cache
 def campaign_of(vut: str = "level0", scenario: Scenario = US23) -> RecordedCampaign:
-    """Return a campaign in SUMO at level 0; its folder stays until the process ends."""
+    """Return a campaign of 20 cases in SUMO at level 0; its folder stays until the process ends.
+
+    Args:
+        vut: spec of the VUT.
+        scenario: the scenario; its own criterion decides what fails.
+    """
     scratch = ScratchFolder()
     _kept.append(scratch)
     folder = Path(scratch.name) / "run"
@@ -114,6 +127,10 @@ def campaign_of(vut: str = "level0", scenario: Scenario = US23) -> RecordedCampa
 
 class VutContract:
     """Contract of a VUT, at a point and on an acceleration lane.
+
+    Example:
+        class TestMyVut(VutContract):
+            vut = "my_vut.py:MyVut"
 
     Attributes:
         vut: the text after `--vut`.

@@ -11,7 +11,7 @@ import pytest
 from support.vut_contract import ON_LANE, begin, factory, run_on
 
 from merge_sumo.drivers.base import MERGE, NO_REQUEST, STAY, Scene
-from merge_sumo.drivers.gap_choice import HEADWAY, GapChoice, GapChoiceVut
+from merge_sumo.drivers.gap_choice import DESIGN, GapChoiceDesign, GapChoiceVut
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.scenario.scenario import DT_S, US23
 from merge_sumo.scenario.trajectory import End
@@ -23,9 +23,9 @@ def scene(x_m: list[float], v_mps: list[float], *, merged: bool = False) -> Scen
     return Scene(np.array([True]), np.array([9]), x, v, merged=np.array([merged]))
 
 
-def answers(x_m, v_mps, *, merged=False, choice=HEADWAY) -> tuple[float, int]:
+def answers(x_m, v_mps, *, merged=False, design=DESIGN) -> tuple[float, int]:
     """Return its answer and its merge request."""
-    vut = GapChoiceVut(1, choice)
+    vut = GapChoiceVut(1, design)
     begin(vut)
     answer = vut.act(scene(x_m, v_mps, merged=merged))
     return float(answer[0]), int(vut.merge_requests()[0])
@@ -49,8 +49,8 @@ def test_a_gap_is_accepted_by_its_time_gaps_in_the_next_step(x_pov, v_pov, merge
 def test_both_gaps_count_and_so_does_the_headway():
     between = [-75.0, -40.0, -10.0, -140.0], [30.0, 20.0, 20.0, 30.0]  # 29 m behind, 25 m ahead
     assert answers(*between)[1] == MERGE
-    assert answers(*between, choice=GapChoice(headway_s=0.96))[1] == MERGE
-    assert answers(*between, choice=GapChoice(headway_s=0.97))[1] == STAY
+    assert answers(*between, design=GapChoiceDesign(headway_s=0.96))[1] == MERGE
+    assert answers(*between, design=GapChoiceDesign(headway_s=0.97))[1] == STAY
     assert answers([-75.0, -40.0, -21.0, -140.0], between[1])[1] == STAY
 
 
