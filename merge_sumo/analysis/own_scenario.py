@@ -74,10 +74,10 @@ def check_scenario(scenario: Scenario, name: str, policies: Path | None) -> Show
         name: its name or file, for commands.
         policies: folder of the learned drivers; None for the shipped ones.
     """
-    found = road_for(scenario)
-    road, differing = about(found), unseen(scenario, policies)
-    warnings = lane_warnings(scenario, found)
-    lines = [*road, *(f"warning: {sentence}" for sentence in warnings)]
+    road = road_for(scenario)
+    sentences, differing = about(road), unseen(scenario, policies)
+    warnings = lane_warnings(scenario, road)
+    lines = [*sentences, *(f"warning: {sentence}" for sentence in warnings)]
     if differing:
         made = quoted(f"{scenario.name}-policies")
         lines += [
@@ -90,4 +90,4 @@ def check_scenario(scenario: Scenario, name: str, policies: Path | None) -> Show
         lines.append(
             "the learned drivers (levels 1 and 2) were trained on such starts, or like ones"
         )
-    return Shown({"about": road, "warnings": warnings, "unseen": differing}, lines)
+    return Shown({"about": sentences, "warnings": warnings, "unseen": differing}, lines)

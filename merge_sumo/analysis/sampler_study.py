@@ -112,11 +112,11 @@ def search(
     for name, seed in tasks:
         sampler = make_sampler(name, pool, seed, controller_model_of(plan, pool, seed))
         size = batch or (None if sampler.uses_predictions else COMPARED_BATCH)
-        groups: Batches = []
-        SearchLoop(sampler, plan, cases, batch=size).run(groups.extend)
+        batches: Batches = []
+        SearchLoop(sampler, plan, cases, batch=size).run(batches.extend)
         found = SamplerRun([], [])
-        for group in groups:
-            found.outcomes.extend(episode.outcome for episode in group)
+        for episodes in batches:
+            found.outcomes.extend(episode.outcome for episode in episodes)
             found.fmc.append(sum(fmc(found.failures(level)) for level in levels))
         searches.append(found)
     return searches

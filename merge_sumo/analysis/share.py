@@ -129,9 +129,8 @@ def write_shares(
             SHARES.write(run.folder, Shares(tuple(own_shares(run))))
         return
     by_equations = plan.needs_sumo is None
-    count = max(LEAST, round(PART * len(run.outcomes) / len(run.levels)))
-    if by_equations:
-        count = CASES
+    part = round(PART * len(run.outcomes) / len(run.levels))
+    count = CASES if by_equations else max(LEAST, part)
     plan = plan.for_verdicts().with_engine(None).with_log(run.folder.resolve() / LOG)
     shares: list[LevelShare] = []
     # Worker processes would take longer to start than the cases by the equations of motion.
