@@ -240,15 +240,15 @@ class WatchedSampler(Sampler):
                     )
         return cases
 
-    def prediction(self, place: int) -> Prediction | None:
+    def prediction(self, position: int) -> Prediction | None:
         """Return the prediction of a case, which returns to the sampler with the outcome.
 
         Args:
-            place: place of the case in the batch.
+            position: position of the case in the batch, from 0.
         """
         if not self._sampler.uses_predictions:
             return None
-        return self._watch.call(self._sampler.prediction, place)
+        return self._watch.call(self._sampler.prediction, position)
 
     def tell(
         self, outcomes: Sequence[Outcome], motions: Mapping[int, FloatArray] | None = None

@@ -124,7 +124,7 @@ class SearchLoop:
             for batch in batches:
                 tell(self._sampler, batch.episodes)
             del self._pending[: len(batches)]
-            self._pend()
+            self._set_pending()
 
     def _has_room(self, running: int) -> bool:
         """Return whether the sampler is asked before it is told the oldest batch."""
@@ -191,11 +191,11 @@ class SearchLoop:
         self._batches_proposed += 1
         self._cases_proposed += len(batch.cases)
         self._pending.append(batch)
-        self._pend()
+        self._set_pending()
         return batch
 
-    def _pend(self) -> None:
-        self._sampler.pend([case for batch in self._pending for case in batch.cases])
+    def _set_pending(self) -> None:
+        self._sampler.set_pending([case for batch in self._pending for case in batch.cases])
 
     def _collect(self, batches: Sequence[_Batch], job: Job[Case, Episode]) -> None:
         """Collect the episodes of batches; note which ran again because a worker had died."""

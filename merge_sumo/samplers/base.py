@@ -15,46 +15,6 @@ from merge_sumo.samplers.history import LevelHistory, bounded
 from merge_sumo.scenario.case import Case, FloatArray, Pool, to_unit
 
 
-class Predictor(Protocol):
-    """Predicts the gaps of cases before they run; a pure function of the outcomes told so far.
-
-    Attributes:
-        members: number of members of its ensemble, M. They learn from different data, so that they
-            disagree where they extrapolate.
-    """
-
-    members: int
-
-    def tell(self, outcomes: Sequence[Outcome], motions: Mapping[int, FloatArray]) -> None:
-        """Learn from outcomes.
-
-        Args:
-            outcomes: outcomes of any level.
-            motions: their motions, (T + 1, A, 3), by index: x in m, v in m/s and a in m/s2 of each
-                of the A vehicles.
-        """
-
-    def can_predict(self, level: int) -> bool:
-        """Return whether the outcomes so far suffice to predict cases of a level.
-
-        Args:
-            level: level of the POV.
-        """
-
-    def predict(
-        self, points: Mapping[int, FloatArray], member: int | None = None
-    ) -> Mapping[int, FloatArray]:
-        """Predict the signed gaps of cases (`Outcome.signed_gap`).
-
-        Args:
-            points: cases of the unit cube by level of the POV, (n, d) each.
-            member: the only member that predicts, from 0 to M - 1; None for all.
-
-        Returns:
-            Gaps by level, (M, n) each, or (1, n) by one member; NaN where the VUT never arrives.
-        """
-
-
 class Sampler(ABC):
     """Proposes the cases of a campaign, and learns from their outcomes; it simulates nothing.
 
@@ -62,7 +22,10 @@ class Sampler(ABC):
     two calls return the same cases, and neither the order of outcomes nor a repeated `tell`
     matters. A campaign resumes by telling the outcomes of its journal to a new sampler.
 
-    A new sampler implements `ask`, or as a `LevelwiseSampler` only `propose`.
+    A new sampler implements `ask`, or as a `LevelwiseSampler` only `propose`; `history`, `pending`,
+    `observed`, `proposed`, `shares` and `rng` are for it. For each batch a campaign calls
+    `batch_size`, `ask`, `prediction` of each case and `set_pending`; once the batch has run, `tell`
+    and `set_pending`.
 
     Attributes:
         about: what it does, in a line without a full stop, for help and documentation.
@@ -118,11 +81,11 @@ class Sampler(ABC):
             The next `n` cases, none of which was proposed before.
         """
 
-    def prediction(self, place: int) -> Prediction | None:
+    def prediction(self, position: int) -> Prediction | None:
         """Return the prediction of a case of the last `ask`.
 
         Args:
-            place: its place in the returned list.
+            position: its position in the returned list, from 0.
 
         Returns:
             The prediction; None where the case was not predicted.
@@ -144,12 +107,13 @@ class Sampler(ABC):
             motions: their motions, (T + 1, A, 3), by index, for the predictor; None without one.
         """
         for outcome in outcomes:
-            self._proposed[outcome.case.level] += outcome.index not in self._outcomes
+            if outcome.index not in self._outcomes:
+                self._proposed[outcome.case.level] += 1
             self._outcomes[outcome.index] = outcome
         if self.predictor is not None and motions is not None:
             self.predictor.tell(outcomes, motions)
 
-    def pend(self, cases: Iterable[Case]) -> None:
+    def set_pending(self, cases: Iterable[Case]) -> None:
         """Replace the pending cases.
 
         They count as proposed, and a sampler that `overlaps` avoids their neighbourhood.
@@ -190,8 +154,10 @@ class Sampler(ABC):
         Args:
             level: level of the POV; None for all levels.
         """
-        pending = sum(level in (None, case.level) for case in self._pending)
-        return pending + (self._proposed.total() if level is None else self._proposed[level])
+        if level is None:
+            return self._proposed.total() + len(self._pending)
+        pending = [case for case in self._pending if case.level == level]
+        return self._proposed[level] + len(pending)
 
     def history(self, level: int) -> LevelHistory:
         """Return the cases of a level that have a verdict as arrays, with a row for each case.
@@ -231,6 +197,10 @@ class Sampler(ABC):
 
         Returns:
             Numbers of cases by level; their sum is `n`.
+
+        Example:
+            >>> make_sampler("coverage", Pool(levels=(0, 1, 2), scenario=US23), seed=1).shares(5)
+            {0: 2, 1: 2, 2: 1}
         """
         weights = weights or dict.fromkeys(self.pool.levels, 1.0)
         by_need = sorted(weights, key=lambda level: (self.proposed(level), level))
@@ -239,7 +209,8 @@ class Sampler(ABC):
             shares[level] = 1
         total = sum(weights.values())
         for _ in range(n - sum(shares.values())):
-            shares[max(by_need, key=lambda level: n * weights[level] / total - shares[level])] += 1
+            missing = {level: n * weights[level] / total - shares[level] for level in by_need}
+            shares[max(missing, key=missing.__getitem__)] += 1
         return shares
 
     def rng(self, *key: int) -> np.random.Generator:
@@ -300,6 +271,46 @@ class LevelwiseSampler(Sampler):
 
         Returns:
             Points, (n, d).
+        """
+
+
+class Predictor(Protocol):
+    """Predicts the gaps of cases before they run; a pure function of the outcomes told so far.
+
+    Attributes:
+        members: number of members of its ensemble, M. They learn from different data, so that they
+            disagree where they extrapolate.
+    """
+
+    members: int
+
+    def tell(self, outcomes: Sequence[Outcome], motions: Mapping[int, FloatArray]) -> None:
+        """Learn from outcomes.
+
+        Args:
+            outcomes: outcomes of any level.
+            motions: their motions, (T + 1, A, 3), by index: x in m, v in m/s and a in m/s2 of each
+                of the A vehicles.
+        """
+
+    def can_predict(self, level: int) -> bool:
+        """Return whether the outcomes so far suffice to predict cases of a level.
+
+        Args:
+            level: level of the POV.
+        """
+
+    def predict(
+        self, points: Mapping[int, FloatArray], member: int | None = None
+    ) -> Mapping[int, FloatArray]:
+        """Predict the signed gaps of cases (`Outcome.signed_gap`).
+
+        Args:
+            points: cases of the unit cube by level of the POV, (n, d) each.
+            member: the only member that predicts, from 0 to M - 1; None for all.
+
+        Returns:
+            Gaps by level, (M, n) each, or (1, n) by one member; NaN where the VUT never arrives.
         """
 
 

@@ -174,7 +174,7 @@ class SamplerContract:
         first = [outcome for outcome in outcomes if outcome.batch == 0]
         pending = [outcome.case for outcome in outcomes if outcome.batch > 0]
         sampler = self.fresh()
-        sampler.pend(pending)
+        sampler.set_pending(pending)
         sampler.tell(first)
         assert sampler.proposed() == len(outcomes)
         if sampler.overlaps:
@@ -182,7 +182,7 @@ class SamplerContract:
             assert not {outcome.case for outcome in outcomes} & set(early)
             assert not sampler.learns or early != proposed
         sampler.tell(outcomes)
-        sampler.pend([])
+        sampler.set_pending([])
         assert sampler.ask(9) == proposed
 
     def test_proposes_other_cases_for_another_seed(self) -> None:

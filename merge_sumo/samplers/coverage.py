@@ -61,13 +61,13 @@ class CoverageSampler(Sampler):
             cases += self.pool.cases(points, level)
         return cases
 
-    def prediction(self, place: int) -> Prediction | None:
+    def prediction(self, position: int) -> Prediction | None:
         """Return the prediction of a case of the last `ask`; None without a model.
 
         Args:
-            place: its place in the returned list.
+            position: its position in the returned list, from 0.
         """
-        return self._predictions[place]
+        return self._predictions[position]
 
     def batch_size(self) -> int:
         """Return the size of the next batch: small while each outcome changes the model most."""

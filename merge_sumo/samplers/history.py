@@ -1,4 +1,4 @@
-"""The outcomes of a level as arrays, which samplers learn from."""
+"""The outcomes of a level as arrays with one row for each case, which samplers learn from."""
 
 from __future__ import annotations
 
@@ -9,24 +9,6 @@ import numpy as np
 
 from merge_sumo.metrics.fmc import BoolArray, IntArray
 from merge_sumo.scenario.case import FloatArray
-
-
-def bounded(margin: FloatArray) -> FloatArray:
-    """Compress large margins, so that a Gaussian process can learn them.
-
-    Margins keep their order and their signs. The function is continuous, and so is its slope.
-
-    Args:
-        margin: margins of any shape; infinite ones are allowed.
-
-    Returns:
-        Margins of the same shape, within -2.5 and 2.5; up to 1.25, as all of the paper's are, they
-        stay as they are.
-    """
-    linear = 1.25
-    size = np.maximum(np.abs(margin), linear)
-    compressed = np.sign(margin) * (2.0 * linear - linear**2 / size)
-    return np.where(size > linear, compressed, margin)
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,6 +55,40 @@ class LevelHistory:
         """Cases that failed, (m, d)."""
         return self.points[self.failed]
 
+    def rows(self, chosen: IntArray) -> LevelHistory:
+        """Return the history of some of the cases.
+
+        Args:
+            chosen: row numbers of these cases, (m,).
+        """
+        arrays: dict[str, Any] = {}
+        for field in fields(self):
+            if field.name != "varies":  # the only field without a value for each case
+                arrays[field.name] = getattr(self, field.name)[chosen]
+        return replace(self, **arrays)
+
+
+def bounded(margin: FloatArray) -> FloatArray:
+    """Compress large margins, so that a Gaussian process can learn them.
+
+    Margins keep their order and their signs. The function is continuous, and so is its slope:
+    m where |m| <= 1.25, else sign(m) (2.5 - 1.25^2 / |m|).
+
+    Args:
+        margin: margins of any shape; infinite ones are allowed.
+
+    Returns:
+        Margins of the same shape, within -2.5 and 2.5. All margins of the paper are at most 1.25.
+
+    Example:
+        >>> bounded(np.array([-0.5, 2.5, np.inf]))
+        array([-0.5  ,  1.875,  2.5  ])
+    """
+    linear = 1.25
+    size = np.maximum(np.abs(margin), linear)  # no division by 0 where the margin stays as it is
+    compressed = np.sign(margin) * (2.0 * linear - linear**2 / size)
+    return np.where(size > linear, compressed, margin)
+
 
 def most_informative(history: LevelHistory, most: int) -> LevelHistory:
     """Limit a history, so that learning from it takes a limited time.
@@ -87,13 +103,8 @@ def most_informative(history: LevelHistory, most: int) -> LevelHistory:
     """
     if len(history.points) <= most:
         return history
-    order = np.argsort(history.margin, kind="stable")
     half = most // 2
-    rest = np.sort(order[half:])
-    evenly = np.linspace(0, len(rest) - 1, half).round().astype(np.int64)
-    chosen = np.sort(np.concatenate([order[:half], rest[evenly]]))
-    columns: dict[str, Any] = {}
-    for column in fields(history):
-        if column.name != "varies":
-            columns[column.name] = getattr(history, column.name)[chosen]
-    return replace(history, **columns)
+    worst_first = np.argsort(history.margin, kind="stable")
+    worst, others = worst_first[:half], np.sort(worst_first[half:])
+    evenly = np.linspace(0, len(others) - 1, half).round().astype(np.int64)
+    return history.rows(np.sort(np.concatenate([worst, others[evenly]])))
