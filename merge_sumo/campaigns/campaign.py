@@ -5,12 +5,20 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from merge_sumo.campaigns.journal import Journal
 from merge_sumo.campaigns.loop import Batches, SearchLoop
-from merge_sumo.campaigns.recorded import AGAINST, FILES, TALLIES, RecordedCampaign, spread_failures
+from merge_sumo.campaigns.recorded import (
+    AGAINST,
+    FILES,
+    TALLIES,
+    RecordedCampaign,
+    has_converged,
+    spread_failures,
+)
 from merge_sumo.campaigns.repeatability import check_repeatability
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.controllers.process import LOG
@@ -97,6 +105,9 @@ def run_campaign(
             for callback in callbacks:
                 callback(stored)
 
+        stop = None
+        if settings.stop_when_converged:
+            stop = partial(has_converged, tolerated=settings.tolerated)
         loop = SearchLoop(
             _sampler(settings, plan),
             plan,
@@ -105,7 +116,7 @@ def run_campaign(
             batch=settings.batch,
             draws=settings.repeat,
             in_flight=settings.in_flight or 0,
-            stop=settings.stopping_rule(),
+            stop=stop,
             history=history,
         )
         loop.run(on_batches)

@@ -17,7 +17,7 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import groupby
 from typing import Final
@@ -49,8 +49,8 @@ class _Batch:
     number: int
     first_index: int
     cases: Sequence[Case]
-    predictions: Sequence[Prediction | None] = ()
-    episodes: list[Episode] = field(default_factory=list)
+    predictions: Sequence[Prediction | None]
+    episodes: list[Episode]
 
 
 class SearchLoop:
@@ -139,9 +139,7 @@ class SearchLoop:
         """Return the batches to submit next; none where the search has ended."""
         if self._history:
             known = self._history.popleft()
-            cases = [episode.outcome.case for episode in known]
-            first = self._cases_proposed
-            return [self._add(_Batch(self._batches_proposed, first, cases, episodes=known))]
+            return [self._add([episode.outcome.case for episode in known], [], known)]
         if self._stop is not None and self._stop(self._sampler.observed()):
             self._until = self._cases_proposed
         end = min(self._until, self._cases_proposed + self._cases_ahead())
@@ -154,10 +152,7 @@ class SearchLoop:
                     cases.append(replace(case, draw=draw))
                     predictions.append(None if draw else self._sampler.prediction(place))
             left = self._until - self._cases_proposed
-            batch = _Batch(
-                self._batches_proposed, self._cases_proposed, cases[:left], predictions[:left]
-            )
-            batches.append(self._add(batch))
+            batches.append(self._add(cases[:left], predictions[:left], []))
         return batches
 
     def _cases_ahead(self) -> int:
@@ -186,10 +181,16 @@ class SearchLoop:
         """
         return min(self._in_flight, self._sampler.batch_size() + self._cases_proposed // AGE)
 
-    def _add(self, batch: _Batch) -> _Batch:
-        """Count a batch as proposed."""
+    def _add(
+        self,
+        cases: Sequence[Case],
+        predictions: Sequence[Prediction | None],
+        episodes: list[Episode],
+    ) -> _Batch:
+        """Return a batch of proposed cases, which is pending."""
+        batch = _Batch(self._batches_proposed, self._cases_proposed, cases, predictions, episodes)
         self._batches_proposed += 1
-        self._cases_proposed += len(batch.cases)
+        self._cases_proposed += len(cases)
         self._pending.append(batch)
         self._set_pending()
         return batch
