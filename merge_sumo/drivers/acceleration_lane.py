@@ -81,7 +81,11 @@ class Merging:
         return self.merged & ~self._states_requests
 
     def begin(self, corridor: int) -> None:
-        """Begin an episode in a corridor, with the VUT on the ramp."""
+        """Begin an episode with the VUT on the ramp.
+
+        Args:
+            corridor: index of the corridor.
+        """
         for flags in (self.merged, self._states_requests, self._merge_requests):
             flags[corridor] = False
 

@@ -179,7 +179,7 @@ def load_network(name: str, folder: Path | None = None) -> QNetwork:
     folder = folder or resource("policies")
     entry = read_manifest(folder).get(name)
     if entry is None:
-        raise UserError(f"there is no policy {name!r}{how_to_train(folder)}")
+        raise UserError(f"unknown policy {name!r}{how_to_train(folder)}")
     path = folder / f"{name}.safetensors"
     try:
         content = read_limited(path, MOST_BYTES)

@@ -160,7 +160,7 @@ class SimulationPlan:
         if engine is None:
             engine = Engine.KINEMATIC if self.needs_sumo is None else Engine.SUMO
         if engine not in list(Engine):
-            raise UserError(f"there is no engine {engine!r}: choose {' or '.join(Engine)}")
+            raise UserError(f"unknown engine {engine!r}: choose {' or '.join(Engine)}")
         if engine == Engine.KINEMATIC and self.needs_sumo is not None:
             raise UserError(f"`engine` kinematic: {self.needs_sumo}; choose `engine` sumo")
         return replace(self, engine=Engine(engine))

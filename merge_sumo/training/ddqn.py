@@ -136,7 +136,11 @@ class Learner:
     """
 
     def __init__(self, network: nn.Sequential) -> None:
-        """Begin with an average that equals the network."""
+        """Begin with an average that equals the network.
+
+        Args:
+            network: the network; its weights change.
+        """
         self.network, self.average = network, deepcopy(network)
         self._weights: list[Tensor] = list(network.parameters())
         self._averages: list[Tensor] = list(self.average.parameters())

@@ -78,7 +78,7 @@ class MergeEnv(gymnasium.Env[FloatArray, np.int64]):
         """
         others = {"pov": "vut", "vut": "pov"}
         if role not in others:
-            raise UserError(f"there is no role {role!r}: choose pov or vut")
+            raise UserError(f"unknown role {role!r}: choose pov or vut")
         if opponent != "level0" and not opponent.startswith(others[role]):
             raise UserError(
                 f"a {role} cannot play against {opponent!r}: choose level0 or a {others[role]}"

@@ -321,7 +321,7 @@ def train_and_check(
     """
     wanted = set(settings.only or NETWORKS)
     if unknown := wanted - set(NETWORKS):
-        raise UserError(f"there is no network {min(unknown)!r}: choose {', '.join(NETWORKS)}")
+        raise UserError(f"unknown network {min(unknown)!r}: choose {', '.join(NETWORKS)}")
     names, played = tuple(name for name in NETWORKS if name in wanted), scenario or US23
     folder = policies_of(played) if settings.out is None else Path(settings.out)
     if not settings.check:

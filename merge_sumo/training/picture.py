@@ -23,9 +23,9 @@ LANE_M = 3.05
 CAR_M = 2.0
 """Width of a car."""
 MARGINS_M = (50.0, 22.5)
-"""Width and height of the picture, in addition to the distance between the cars."""
+"""Least width and height of the shown road, without the distance between the cars."""
 LABEL_PX = 26.0
-"""Distance from the centre of a car to that of its label."""
+"""Distance from the centre of a car to the centre of its label."""
 MERGE_LINE = np.array([[0.0, -2.4], [0.0, 5.4]])
 """Ends of the line across the road at M, (2, 2), in m."""
 

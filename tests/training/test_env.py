@@ -42,7 +42,7 @@ def test_anything_but_an_action_is_refused(action):
 @pytest.mark.parametrize(
     ("settings", "sentence"),
     [
-        ({"role": "bus"}, "no role 'bus'"),
+        ({"role": "bus"}, "unknown role 'bus'"),
         ({"role": "vut", "svo": 0.5}, "svo is the orientation of a POV"),
         ({"opponent": "pov1"}, "cannot play against 'pov1'"),
         ({"opponent": "vut1", "svo": "selfish"}, "svo is .*: choose 'random', or 0 up to"),

@@ -285,7 +285,7 @@ def test_a_limit_outside_that_of_the_scenario_is_refused(tmp_path, a_min_mps2):
     ("words", "said"),
     [
         (("--only", "pov2", "--out", "new"), "pov2 is trained against vut1: train that one first"),
-        (("--only", "pov3"), "there is no network 'pov3': choose pov1, vut1, pov2, vut2"),
+        (("--only", "pov3"), "unknown network 'pov3': choose pov1, vut1, pov2, vut2"),
         (("--scenario", "roundabout"), "the shipped policies are for us23"),
         (("--check", "--out", "none"), "none has no pov1: run `merge-sumo train`"),
     ],
