@@ -166,7 +166,7 @@ def write_openscenario(run: RecordedCampaign, index: int, folder: Path, road: Ro
         run: the campaign.
         index: index of the case.
         folder: new folder to write.
-        road: corridor of the scenario.
+        road: road of the scenario.
 
     Returns:
         The path of the first OpenSCENARIO file.
