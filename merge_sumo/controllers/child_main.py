@@ -31,7 +31,7 @@ from merge_sumo.scenario.signals import StepSignals
 from merge_sumo.spawning import named
 
 ALIVE_S = 0.25
-"""Least time between two messages that a request is being worked on."""
+"""Least time between two messages to the parent that a request is still in progress."""
 INSTALLED_FOLDERS = (
     *(sys.prefix, sys.base_prefix, site.getusersitepackages()),
     str(Path(__file__).parents[1]),
@@ -86,7 +86,7 @@ decode_request = msgspec.msgpack.Decoder(
     HostRequest, dec_hook=lambda _, rows: np.array(rows)
 ).decode
 decode_reply = msgspec.msgpack.Decoder(HostReply | None).decode
-"""A reply of None says that the request is still being worked on."""
+"""A reply of None says that the request is still in progress."""
 
 
 def main(settings: Mapping[str, Any]) -> None:

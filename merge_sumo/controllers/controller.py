@@ -274,9 +274,9 @@ class ControllerArray(ControllerDriver):
     answers no acceleration ends with NaN as the answer of its corridor, and `reason` has the error
     in words. In a child process `child_main._Host` sends both, and `hosted.HostedDriver` gives both
     to the parent. `Rollout.note_faults` finds the NaN, asks for the reason, and ends that episode
-    alone as `End.VUT_ERROR`; `Outcome.error` and the line of `outcomes.jsonl` have the words. The
-    next episode in the corridor has a new controller. A crash of the child process takes another
-    way: see `HostedDriver`.
+    alone as `End.VUT_ERROR`. The words are the `error` of the trajectory, of the outcome, and of
+    its line in `outcomes.jsonl`. The next episode in the corridor has a new controller. A crash of
+    the child process takes another way: see `HostedDriver`.
     """
 
     def __init__(self, corridors: int, new: Callable[[], Controller], deadline_s: float) -> None:

@@ -456,14 +456,14 @@ class Session:
         if setter == SET_VEHICLE:
             self._check_vehicle(target)
         arguments = reader.arguments()
-        if effect is Effect.ON_A_LANE and not self.sumo.has_lane:
-            effect = Effect.IN_VAIN
-        # Keys with a dot are of devices and models.
-        if effect is Effect.OWN_KEYS and (target != VUT_ID or "." in str(arguments[:1])):
-            effect = Effect.IN_VAIN
-        if effect is Effect.IN_VAIN:
+        is_in_vain = effect is Effect.IN_VAIN
+        if effect is Effect.ON_A_LANE:
+            is_in_vain = not self.sumo.has_lane
+        elif effect is Effect.OWN_KEYS:  # keys with a dot are of devices and models
+            is_in_vain = target != VUT_ID or "." in str(arguments[:1])
+        if is_in_vain:
             self.in_vain.add(name)
-        if effect in (Effect.LOOKS, Effect.IN_VAIN):
+        if is_in_vain or effect is Effect.LOOKS:
             return
         if target not in (VUT_ID, OWN_TYPE):
             raise RefusedError(f"{target!r} is not the controller's to command")
