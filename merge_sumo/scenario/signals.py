@@ -19,19 +19,20 @@ from merge_sumo.printable import printable
 
 StepSignals = dict[str, float | str]
 """Values of one step, by name."""
-Signals = dict[str, tuple[float | str | None, ...]]
-"""Values of a case by name, one for each row of its motion; None where the controller set none."""
+RowValue = float | str | None
+"""Value of a signal in a row of a motion; None where the controller set none."""
+Signals = dict[str, tuple[RowValue, ...]]
+"""Values of a case by name, one for each row of its motion."""
 
 MOST_NAMES = 8
 """Maximum number of signals of a case."""
 CHARACTERS = 40
 """Maximum length of a name, and of a word."""
 
-SignalRuns = Annotated[
-    dict[str, tuple[tuple[Annotated[int, Meta(ge=1)], float | str | None], ...]],
-    Meta(min_length=1, max_length=MOST_NAMES),
-]
-"""Run-length encoded signals for JSON: by name, (number of rows, value) for each run of a value."""
+Run = tuple[Annotated[int, Meta(ge=1)], RowValue]
+"""Rows that follow each other with the same value: their number, and the value."""
+SignalRuns = Annotated[dict[str, tuple[Run, ...]], Meta(min_length=1, max_length=MOST_NAMES)]
+"""Run-length encoded signals for JSON, by name."""
 
 
 def valid_signals(values: object) -> StepSignals:
@@ -56,13 +57,14 @@ def valid_signals(values: object) -> StepSignals:
     for name, value in islice(values.items(), MOST_NAMES):
         valid = _valid_value(value)
         if valid is not None and isinstance(name, str):
-            signals[_word(name)] = valid
+            signals[_cut_text(name)] = valid
     return signals
 
 
-def _valid_value(value: object) -> float | str | None:
+def _valid_value(value: object) -> RowValue:
+    """Return a value as a signal has it: six digits, a cut text, "true" or "false"; else None."""
     if isinstance(value, str):
-        return _word(value)
+        return _cut_text(value)
     if isinstance(value, bool | np.bool_):
         return "true" if value else "false"
     if not isinstance(value, int | float | np.integer | np.floating):
@@ -74,12 +76,13 @@ def _valid_value(value: object) -> float | str | None:
     return number if math.isfinite(number) else None
 
 
-def _word(text: str) -> str:
-    # A subclass of `str` may override its methods: take its characters only.
+def _cut_text(text: str) -> str:
+    # A subclass of `str` may override its methods: take its characters only. They are cut twice:
+    # before, as the text may be huge; after, as an escape is longer than its character.
     return printable(str.__str__(text)[:CHARACTERS])[:CHARACTERS]
 
 
-def by_name(steps: Iterable[tuple[int, StepSignals]], rows: int) -> Signals | None:
+def columns_of(steps: Iterable[tuple[int, StepSignals]], rows: int) -> Signals | None:
     """Collect the signals of the steps of a case by name.
 
     Args:
@@ -90,10 +93,10 @@ def by_name(steps: Iterable[tuple[int, StepSignals]], rows: int) -> Signals | No
         The first `MOST_NAMES` signals; None where the controller set none.
 
     Example:
-        >>> by_name([(0, {"mode": "go"}), (1, {"mode": "yield"})], 3)
+        >>> columns_of([(0, {"mode": "go"}), (1, {"mode": "yield"})], 3)
         {'mode': ('go', 'yield', None)}
     """
-    columns: dict[str, list[float | str | None]] = {}
+    columns: dict[str, list[RowValue]] = {}
     for row, signals in steps:
         if row >= rows:
             break
@@ -134,14 +137,20 @@ def from_runs(record: SignalRuns, rows: int) -> Signals:
 
     Raises:
         UserError: a signal has another number of rows, or a value that merge-sumo does not write.
+
+    Example:
+        >>> from_runs({"mode": ((2, "go"), (1, None))}, 3)
+        {'mode': ('go', 'go', None)}
     """
     signals: Signals = {}
     for name, runs in record.items():
+        # Before the values are repeated: a count in a hostile file may exceed the memory.
         if sum(count for count, _ in runs) != rows:
             raise UserError("a signal has other rows than the motion")
-        values: list[float | str | None] = []
+        values: list[RowValue] = []
         for count, value in runs:
-            if _word(name) != name or (value is not None and _valid_value(value) != value):
+            is_own = value is None or _valid_value(value) == value
+            if _cut_text(name) != name or not is_own:
                 raise UserError("a signal has a value that merge-sumo does not write")
             values += [value] * count
         signals[name] = tuple(values)

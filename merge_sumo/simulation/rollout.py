@@ -15,7 +15,7 @@ from merge_sumo.drivers.base import ControllerDiedError, Driver, PovDiedError, S
 from merge_sumo.drivers.car_following import conflicting_car, keep_safe
 from merge_sumo.scenario.case import Case, FloatArray
 from merge_sumo.scenario.scenario import DT_S, MAX_EPISODE_S, OWN, VUT
-from merge_sumo.scenario.signals import StepSignals, by_name
+from merge_sumo.scenario.signals import StepSignals, columns_of
 from merge_sumo.scenario.trajectory import End, Trajectory, cut_at
 from merge_sumo.simulation.kinematic_simulation import KinematicSimulation
 from merge_sumo.sumo.sumo_simulation import SimulationError, SumoSimulation
@@ -376,7 +376,7 @@ class Rollout:
         motion[-1, :, 2] = 0.0
         # A vehicle that comes to a stand brakes only as hard as that takes.
         np.maximum(motion[..., 2], motion[..., 1] / -DT_S, out=motion[..., 2])
-        left = by_name(episode.left, len(motion)), tuple(sorted(self.vut.in_vain(corridor)))
+        left = columns_of(episode.left, len(motion)), tuple(sorted(self.vut.in_vain(corridor)))
         if episode.merge_row is None or (error is not None and self.merging is not None):
             after, clipped = None, int(self.clipped[corridor])
         else:

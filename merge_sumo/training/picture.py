@@ -18,6 +18,7 @@ from merge_sumo.scenario.scenario import COLOURS, Scenario
 ROAD = "#c9c7c1"
 INK = "#1c2228"
 SIZE_PX = np.array([960, 240])
+"""Width and height of a picture."""
 LANE_M = 3.05
 """Drawn width of a lane of 3.2 m: the rest is the line between two lanes."""
 CAR_M = 2.0
@@ -26,8 +27,11 @@ MARGINS_M = (50.0, 22.5)
 """Least width and height of the shown road, without the distance between the cars."""
 LABEL_PX = 26.0
 """Distance from the centre of a car to the centre of its label."""
-MERGE_LINE = np.array([[0.0, -2.4], [0.0, 5.4]])
-"""Ends of the line across the road at M, (2, 2), in m."""
+MERGE_LINE_M = np.array([[0.0, -2.4], [0.0, 5.4]])
+"""Ends of the line across the road at M, (2, 2)."""
+MERGE_LINE_WIDTH_M = 0.25
+FONT_PX = 22
+"""Size of the font of labels."""
 
 
 class GamePicture:
@@ -47,6 +51,7 @@ class GamePicture:
         Raises:
             UserError: if pygame is not installed.
         """
+        # Imported here: pygame comes with the extra "train" only.
         try:
             self._pygame: Any = importlib.import_module("pygame")
         except ImportError as error:
@@ -66,22 +71,27 @@ class GamePicture:
         """
         x_pov_m, v_pov_mps, x_vut_m, v_vut_mps = state
         pov_length_m, vut_length_m = self._lengths_m
-        pov = self._car("main", x_pov_m - pov_length_m, x_pov_m)
-        vut = self._car("ramp", x_vut_m - vut_length_m, x_vut_m)
-        canvas = _Canvas(self._pygame, pov[1], vut[1])
+        pov_ends_m = self._ends_of_car("main", x_pov_m - pov_length_m, x_pov_m)
+        vut_ends_m = self._ends_of_car("ramp", x_vut_m - vut_length_m, x_vut_m)
+        _, pov_front_m = pov_ends_m
+        _, vut_front_m = vut_ends_m
+        canvas = _Canvas(self._pygame, pov_front_m, vut_front_m)
         for lane in self._road["lanes"]:
             canvas.draw_line(ROAD, np.array(lane), LANE_M)
-        canvas.draw_line(INK, MERGE_LINE, 0.25)
-        canvas.draw_car("pov", pov, v_pov_mps, -LABEL_PX)
-        canvas.draw_car("vut", vut, v_vut_mps, LABEL_PX)
+        canvas.draw_line(INK, MERGE_LINE_M, MERGE_LINE_WIDTH_M)
+        canvas.draw_car("pov", pov_ends_m, v_pov_mps, -LABEL_PX)
+        canvas.draw_car("vut", vut_ends_m, v_vut_mps, LABEL_PX)
+        # pygame's arrays have the columns first: (width, height, 3).
         columns = self._pygame.surfarray.array3d(canvas.surface)
         return np.ascontiguousarray(columns.transpose(1, 0, 2))
 
-    def _car(self, path: str, rear_m: float, front_m: float) -> FloatArray:
+    def _ends_of_car(self, path: str, rear_m: float, front_m: float) -> FloatArray:
         """Return the points of the rear and the front of a car on a path of the road, (2, 2)."""
         along_m, x_m, y_m = np.array(self._road[path]).T
         ends_m = rear_m, front_m
-        return np.column_stack([np.interp(ends_m, along_m, x_m), np.interp(ends_m, along_m, y_m)])
+        x_ends_m = np.interp(ends_m, along_m, x_m)
+        y_ends_m = np.interp(ends_m, along_m, y_m)
+        return np.column_stack([x_ends_m, y_ends_m])
 
 
 class _Canvas:
@@ -101,12 +111,16 @@ class _Canvas:
         self._pygame.draw.lines(self.surface, colour, False, self._pixels(points_m), width_px)
 
     def draw_car(self, name: str, ends_m: FloatArray, v_mps: float, down_px: float) -> None:
-        """Draw a car from its rear to its front, (2, 2), and its speed as a label below it."""
+        """Draw a car from its rear to its front, (2, 2), and its speed as a label.
+
+        The label is `down_px` below the car; above it where the number is negative.
+        """
         self.draw_line(COLOURS[name], ends_m, CAR_M)
-        font = self._pygame.font.Font(None, 22)
+        font = self._pygame.font.Font(None, FONT_PX)
         text = font.render(f"{name.upper()} {v_mps:.1f} m/s", True, INK)
         x_px, y_px = self._pixels(ends_m).mean(axis=0)
         label = text.get_rect(center=(x_px, y_px + down_px))
+        # A label that would leave the picture is moved to its edge.
         self.surface.blit(text, label.clamp(self.surface.get_rect()))
 
     def _pixels(self, points_m: FloatArray) -> FloatArray:
