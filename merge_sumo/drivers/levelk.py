@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from merge_sumo.drivers.base import Driver, Scene
 from merge_sumo.drivers.level0 import level0_time_to
 from merge_sumo.scenario.case import Case, FloatArray
-from merge_sumo.scenario.scenario import US23, Scenario, Units
+from merge_sumo.scenario.scenario import Scenario, Units
 
 BRAKING = (1.0, 0.75, 0.5, 0.25)
 """Shares of the hardest braking that a learned driver chooses from; it may also coast."""
@@ -353,20 +353,16 @@ class LevelKDriver(Driver):
         self._svo_rad = np.zeros(corridors)
         self._held = np.zeros(corridors)
         """Accelerations, (K,); NaN where the action values of the last decision were not finite."""
-        self._limited = network.limited(US23)
-        """The scenario with the network's limit of braking."""
 
     def begin(self, corridor: int, case: Case) -> None:
-        """Take the scenario and the social value orientation of a case.
+        """Take the social value orientation of a case.
 
         Args:
             corridor: index of the corridor.
             case: the case of the next episode.
         """
-        self._svo_rad[corridor] = case.svo_rad or 0.0
-        if case.scenario is not self.scenario:
-            self._limited = self.network.limited(case.scenario)
         super().begin(corridor, case)
+        self._svo_rad[corridor] = case.svo_rad or 0.0
 
     def act(self, scene: Scene) -> FloatArray:
         """Return the held accelerations, (K,), after a decision where one is due.
@@ -381,9 +377,10 @@ class LevelKDriver(Driver):
             return self._held
         columns = scene.x_pov_m, scene.v_pov_mps, scene.x_vut_m, scene.v_vut_mps
         state = [column[due] for column in columns]
-        inputs = self.network.observe(state, self._svo_rad[due], self._limited)
+        limited = self.network.limited(self.scenario)
+        inputs = self.network.observe(state, self._svo_rad[due], limited)
         actions = self.network.greedy(inputs)
-        self._held[due] = np.where(actions < 0, np.nan, actions_mps2(self._limited)[actions])
+        self._held[due] = np.where(actions < 0, np.nan, actions_mps2(limited)[actions])
         return self._held
 
     def reason(self, corridor: int) -> str | None:

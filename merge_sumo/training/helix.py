@@ -336,7 +336,9 @@ def train_and_check(
             on_part(f"{now.network} {now.stage}", now.done, now.total, "updates", note)
 
         train_library(
-            *(folder, names, settings.seed),
+            folder,
+            names,
+            settings.seed,
             scenario=played,
             a_min_mps2=settings.a_min,
             on_progress=progressed,
