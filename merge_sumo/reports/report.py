@@ -1,5 +1,7 @@
 """The report of a campaign: one HTML file that needs no network.
 
+`write_report` writes it; `RunningReport` rewrites it while a campaign runs.
+
 Names and messages may be hostile: the template escapes them, the JSON has no "<", the script sets
 text and no markup, and the policy of the page allows that script alone and loads nothing.
 """
@@ -10,7 +12,6 @@ import math
 import time
 from collections import Counter
 from collections.abc import Sequence
-from contextlib import suppress
 from datetime import datetime
 from pathlib import Path
 from typing import Self
@@ -38,11 +39,11 @@ from merge_sumo.reports.report_model import INDEX, ReportModel
 from merge_sumo.reports.text import comparison_headline, headline, robustness
 
 REPORT = "report.html"
-FIRST_S = 2.0
+FIRST_REPORT_S = 2.0
 """Time after which the report of a running campaign first appears, in s."""
-EVERY_S = 5
+REPORT_EVERY_S = 5
 """Minimum time between two reports of a running campaign, in s."""
-MOST_SHARE = 0.1
+MOST_REPORTS_SHARE = 0.1
 """Maximum share of the time of a campaign for its reports."""
 
 
@@ -67,6 +68,72 @@ def write_report(run: RecordedCampaign) -> Path:
     return run.folder / REPORT
 
 
+def report_page(model: ReportModel, *, running: bool = False) -> str:
+    """Return the report of a campaign as HTML.
+
+    Args:
+        model: the content of the report.
+        running: whether the campaign runs; a browser then loads the page every few seconds.
+
+    Example:
+        >>> html = report_page(ReportModel(ms.open_run("runs/latest").recorded, learns=False))
+    """
+    run = model.run
+    warnings = []
+    for warning in (unrepeatable(read_second_runs(run)), mostly_clipped(run.cases)):
+        if warning is not None:
+            warnings.append(warning)
+    notes = doubts(run.cases, run.criterion, run.settings.in_vain)
+    if run.settings.ran_again:
+        notes.append(run.ran_again_in_words)
+    # No "<" in the JSON: nothing in it can end its element.
+    data = msgspec.json.encode(page_data(model)).decode().replace("<", "\\u003c")
+    return page(
+        "report.html.jinja",
+        styles=("report.css",),
+        scripts=("player.js", "report.js"),
+        every_s=REPORT_EVERY_S if running else 0,
+        now=f"{datetime.now().astimezone():%H:%M:%S}",
+        index=str(INDEX),
+        data=Markup(data),  # noqa: S704 (JSON without "<")
+        # Of this campaign.
+        model=model,
+        warnings=warnings,
+        notes=notes,
+        go_on=campaign_command("resume", run.folder, run.record),
+        printed=end_of(run.folder / LOG),
+        levels=by_level(model.facts),
+        headline=headline(run, model.facts),
+        kinds=Counter(model.kinds.values()).most_common(),
+        # Constants of the sections.
+        starts_that_fail=STARTS_THAT_FAIL,
+        failures=FAILURES,
+        broken=(ERRORS, TIMEOUTS),
+        kind_meanings=MEANINGS,
+        references=list(REFERENCE_DRIVERS),
+        braked_mps=BRAKED_MPS,
+        # Functions that the sections call.
+        meanings=meanings,
+        comparison_headline=comparison_headline,
+        robustness=robustness,
+        pairs_of=pairs_of,
+        radius_for=radius_for,
+    )
+
+
+def check_report(folder: Path) -> None:
+    """Check that the report of a campaign can be replaced.
+
+    Args:
+        folder: folder of the campaign.
+
+    Raises:
+        UserError: merge-sumo did not create the report in it.
+    """
+    check_generated(folder / REPORT)
+    check_generated(folder / AGAINST_PAGE)
+
+
 def _replace(run: RecordedCampaign, html: str) -> None:
     replace_own(run.folder / REPORT, html.encode(errors="backslashreplace"), GENERATOR)
 
@@ -89,7 +156,7 @@ class RunningReport:
             folder: folder of the campaign.
         """
         self._folder = folder
-        self._due_s = time.monotonic() + FIRST_S
+        self._due_s = time.monotonic() + FIRST_REPORT_S
         self._is_there = False
 
     def rewrite(self, _: Sequence[Outcome] = ()) -> None:
@@ -101,11 +168,11 @@ class RunningReport:
         start_s = time.monotonic()
         if start_s < self._due_s or not (self._folder / OUTCOMES).is_file():
             return
-        self._write(running=True)
+        self._is_there = self._write(running=True)
         took_s = time.monotonic() - start_s
-        self._due_s = start_s + max(EVERY_S, took_s / MOST_SHARE)
+        self._due_s = start_s + max(REPORT_EVERY_S, took_s / MOST_REPORTS_SHARE)
         if not self._is_there:
-            self._due_s = math.inf
+            self._due_s = math.inf  # no second try: the last report gives the reason
 
     def __enter__(self) -> Self:
         return self
@@ -113,71 +180,13 @@ class RunningReport:
     def __exit__(self, _kind: object, error: BaseException | None, _trace: object) -> None:
         """Write the finished cases into the report of a campaign that was stopped."""
         if error is not None and self._is_there:
-            self._write(running=False)
+            self._is_there = self._write(running=False)
 
-    def _write(self, *, running: bool) -> None:
-        self._is_there = False
-        with suppress(UserError):
+    def _write(self, *, running: bool) -> bool:
+        """Write the report of the cases so far; return whether that was possible."""
+        try:
             run = RecordedCampaign(self._folder)
             _replace(run, report_page(ReportModel(run, learns=False), running=running))
-            self._is_there = True
-
-
-def check_report(folder: Path) -> None:
-    """Check that the report of a campaign can be replaced.
-
-    Args:
-        folder: folder of the campaign.
-
-    Raises:
-        UserError: merge-sumo did not create the report in it.
-    """
-    check_generated(folder / REPORT)
-    check_generated(folder / AGAINST_PAGE)
-
-
-def report_page(model: ReportModel, *, running: bool = False) -> str:
-    """Return the report of a campaign as HTML.
-
-    Args:
-        model: the content of the report.
-        running: whether the campaign runs; a browser then loads the page every few seconds.
-
-    Example:
-        >>> html = report_page(ReportModel(ms.open_run("runs/latest").recorded, learns=False))
-    """
-    run = model.run
-    warnings = [unrepeatable(read_second_runs(run)), mostly_clipped(run.cases)]
-    notes = doubts(run.cases, run.criterion, run.settings.in_vain)
-    if run.settings.ran_again:
-        notes.append(run.ran_again_in_words)
-    # No "<" in the JSON: nothing in it can end its element.
-    data = msgspec.json.encode(page_data(model)).decode().replace("<", "\\u003c")
-    return page(
-        "report.html.jinja",
-        styles=("report.css",),
-        scripts=("player.js", "report.js"),
-        every_s=EVERY_S if running else 0,
-        now=f"{datetime.now().astimezone():%H:%M:%S}",
-        index=str(INDEX),
-        data=Markup(data),  # noqa: S704 (JSON without "<")
-        model=model,
-        warnings=filter(None, warnings),
-        notes=notes,
-        go_on=campaign_command("resume", run.folder, run.record),
-        printed=end_of(run.folder / LOG),
-        meanings=meanings,
-        levels=by_level(model.facts),
-        headline=headline(run, model.facts),
-        comparison_headline=comparison_headline,
-        robustness=robustness,
-        starts_that_fail=STARTS_THAT_FAIL,
-        failures=FAILURES,
-        broken=(ERRORS, TIMEOUTS),
-        kinds=Counter(model.kinds.values()).most_common(),
-        kind_meanings=MEANINGS,
-        pairs_of=pairs_of,
-        radius_for=radius_for,
-        references=list(REFERENCE_DRIVERS),
-        braked_mps=BRAKED_MPS,
-    )
+        except UserError:
+            return False
+        return True

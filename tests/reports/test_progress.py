@@ -13,7 +13,7 @@ from support.handmade import write_run
 
 from merge_sumo.metrics.summary import summarise
 from merge_sumo.reports.progress import CampaignBars, rate_text
-from merge_sumo.reports.report import EVERY_S, FIRST_S, REPORT, RunningReport
+from merge_sumo.reports.report import FIRST_REPORT_S, REPORT, REPORT_EVERY_S, RunningReport
 
 
 @pytest.fixture(scope="module")
@@ -86,14 +86,14 @@ class TestTheReportOfACampaignThatRuns:
         report = RunningReport(run.folder)
         report.rewrite(run.outcomes[:1])
         assert not (run.folder / REPORT).exists(), "a short campaign goes without"
-        clock[0] += FIRST_S
+        clock[0] += FIRST_REPORT_S
         return run, report
 
     def test_is_the_report_without_surrogates_and_is_loaded_again(self, own, clock):
         run, report = own
         report.rewrite()
         root = html.parse(run.folder / REPORT).getroot()
-        assert root.xpath("//meta[@http-equiv='refresh']/@content") == [str(EVERY_S)]
+        assert root.xpath("//meta[@http-equiv='refresh']/@content") == [str(REPORT_EVERY_S)]
         assert "This campaign runs, 90 cases in all" in root.text_content()
         failing = [o for o in run.outcomes if o.failed]
         assert root.xpath("//tr[@class='all']//b/text()") == ["60", str(len(failing))]
@@ -115,6 +115,6 @@ class TestTheReportOfACampaignThatRuns:
         (other := tmp_path / "other.html").write_text("mine")
         (run.folder / REPORT).symlink_to(other)
         for _ in run.outcomes:
-            clock[0] += EVERY_S
+            clock[0] += REPORT_EVERY_S
             report.rewrite()
         assert (run.folder / REPORT).read_text() == other.read_text() == "mine"
