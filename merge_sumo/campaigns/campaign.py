@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +15,6 @@ from merge_sumo.campaigns.recorded import (
     FILES,
     TALLIES,
     RecordedCampaign,
-    has_converged,
     spread_failures,
 )
 from merge_sumo.campaigns.repeatability import check_repeatability
@@ -105,9 +103,6 @@ def run_campaign(
             for callback in callbacks:
                 callback(stored)
 
-        stop = None
-        if settings.stop_when_converged:
-            stop = partial(has_converged, tolerated=settings.tolerated)
         loop = SearchLoop(
             _sampler(settings, plan),
             plan,
@@ -116,7 +111,7 @@ def run_campaign(
             batch=settings.batch,
             draws=settings.repeat,
             in_flight=settings.in_flight or 0,
-            stop=stop,
+            stop=settings.stopping_rule(),
             history=history,
         )
         loop.run(on_batches)

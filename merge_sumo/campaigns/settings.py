@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, dataclass, fields, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ from merge_sumo.campaigns.recorded import (
     NAME_CHARACTERS,
     SETTINGS,
     ControllerText,
+    has_converged,
     recorded_scenario,
 )
 from merge_sumo.config import MOST_CASES, Search, non_defaults
@@ -21,6 +23,7 @@ from merge_sumo.controllers.spec import ControllerOptions
 from merge_sumo.drivers.policies import policies_name
 from merge_sumo.errors import UserError
 from merge_sumo.metrics.criterion import PAPER_CRITERION, Criterion
+from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.metrics.summary import check_tolerated
 from merge_sumo.printable import printable
 from merge_sumo.records import RecordError, check_fields, to_plain
@@ -156,6 +159,12 @@ class CampaignSettings(Search):
         if self.against is None:
             raise UserError("the campaign is against no earlier version")
         return replace(self, vut=self.against, against=None)
+
+    def stopping_rule(self) -> Callable[[Sequence[Outcome]], bool] | None:
+        """Return a function of all outcomes that ends the search; None without one."""
+        if not self.stop_when_converged:
+            return None
+        return partial(has_converged, tolerated=self.tolerated)
 
     def new_sampler(self, predictor: Predictor | None = None) -> Sampler:
         """Return the sampler, without outcomes.
