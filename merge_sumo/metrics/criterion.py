@@ -73,6 +73,9 @@ TEXTS = {
 class Criterion:
     """The failure criterion of a campaign.
 
+    `as_written` is the text of the user, `condition` the same with the condition of a named
+    criterion in place of its name, and `description` a clause for a report.
+
     Attributes:
         fail_when: the name of a criterion, or a condition over measures, as Python writes it.
         require: a formula of signal temporal logic that has to hold, in place of a condition; its
@@ -91,12 +94,13 @@ class Criterion:
 
     def __post_init__(self) -> None:
         """Check the condition, and write it as Python would."""
-        name = self.fail_when.strip()
-        if name not in CRITERIA:
-            _, name = _parsed(self.fail_when)
-        object.__setattr__(self, "fail_when", name)
+        fail_when = self.fail_when.strip()
+        if fail_when not in CRITERIA:
+            _, fail_when = _parsed(self.fail_when)
+        # The class is frozen: a dataclass sets its own fields this way.
+        object.__setattr__(self, "fail_when", fail_when)
         if self.require is not None:
-            if name != PAPER:
+            if fail_when != PAPER:
                 raise UserError("`fail_when` and `require` both say what a failure is: choose one")
             object.__setattr__(self, "require", check_formula(self.require))
 
@@ -127,7 +131,7 @@ class Criterion:
                 )
 
     @property
-    def is_papers(self) -> bool:
+    def is_of_paper(self) -> bool:
         """Whether it is the criterion of the paper, whose margin is that of the score."""
         return self.fail_when == PAPER and self.require is None
 
@@ -142,7 +146,7 @@ class Criterion:
         Args:
             scenario: the scenario.
         """
-        if self.is_papers:
+        if self.is_of_paper:
             limit = f"{scenario.dx_crash_m:g} m"
             return f"front bumpers are within {limit} when the VUT reaches {scenario.goal}"
         return self.condition
@@ -159,15 +163,18 @@ class Criterion:
         return self.as_written if named is None else named.condition
 
     def margin(self, trajectory: Trajectory, measures: Measures) -> float | None:
-        """Return the margin of an episode; None after an error.
+        """Return the margin of an episode.
 
         Args:
             trajectory: the motion.
             measures: its measures.
+
+        Returns:
+            The distance from failing, below 0 for a failure, without a unit; None after an error.
         """
         if measures.end.is_error:
             return None
-        if self.is_papers:
+        if self.is_of_paper:
             return margin_of(measures.score)
         if self.require is not None:
             return robustness(self.require, trajectory)
@@ -177,7 +184,9 @@ class Criterion:
     def outcome(
         self, trajectory: Trajectory, lines: CentreLines | None = None, index: int = 0
     ) -> Outcome:
-        """Return the outcome of an episode outside of campaigns; measures follow when read.
+        """Return the outcome of an episode outside of campaigns.
+
+        A measure is calculated when it is first read.
 
         Args:
             trajectory: the motion.
@@ -186,7 +195,7 @@ class Criterion:
         """
         measures = Measures(trajectory, lines)
         margin = self.margin(trajectory, measures)
-        return Outcome(index, 0, trajectory.case, measures, margin=margin)
+        return Outcome(index=index, batch=0, case=trajectory.case, measures=measures, margin=margin)
 
     def is_close_call(
         self, trajectory: Trajectory, rounding: float, lines: CentreLines | None = None
@@ -198,10 +207,13 @@ class Criterion:
             rounding: largest rounding error of a position, m.
             lines: centre lines of the road.
         """
-        if self.is_papers:
-            last, crash_m = trajectory.motion[-1, :, 0], trajectory.case.scenario.dx_crash_m
-            return bool(abs(abs(last[trajectory.nearest] - last[VUT]) - crash_m) <= rounding)
+        if self.is_of_paper:
+            x_m = trajectory.motion[-1, :, 0]
+            distance_m = abs(x_m[trajectory.nearest] - x_m[VUT])
+            from_limit_m = abs(distance_m - trajectory.case.scenario.dx_crash_m)
+            return bool(from_limit_m <= rounding)
         margin = self.outcome(trajectory, lines).margin
+        # A margin has no unit. The same number serves: it is 100,000 times the measured error.
         return margin is not None and abs(margin) <= rounding
 
 
@@ -250,12 +262,18 @@ def values_of(measures: Measures, names: Iterable[str] | None = None) -> dict[st
     }
     values: dict[str, Value] = {}
     for name in vocabulary() if names is None else names:
-        value, measure = measures.value(name), known_measures()[name]
-        if value is None and name in TEXTS:
-            value = ""
-        elif value is None and is_too_late.get(name):
-            value = math.inf if measure.worse == "high" else -math.inf
-        elif value is None:
-            value = measure.missing
+        value = measures.value(name)
+        if value is None:
+            value = _in_place_of_none(name, is_too_late=is_too_late.get(name, False))
         values[name] = value if isinstance(value, str) else float(value)
     return values
+
+
+def _in_place_of_none(name: str, *, is_too_late: bool) -> Value:
+    """Return what a condition compares where a measure has no value."""
+    measure = known_measures()[name]
+    if measure.missing is None:  # a text
+        return ""
+    if is_too_late:
+        return math.inf if measure.worse == "high" else -math.inf
+    return measure.missing

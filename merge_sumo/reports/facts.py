@@ -113,7 +113,7 @@ def facts_of(run: RecordedCampaign, summary: Summary) -> list[Fact]:
         >>> facts[0].name, facts[0].shown
         ('VUT', 'design2')
     """
-    failing = run.criterion.condition if run.criterion.is_papers else "margin < 0"
+    failing = run.criterion.condition if run.criterion.is_of_paper else "margin < 0"
     facts = [*_settings(run), *_shares(run), *_counts(run, summary, failing)]
     for level in summary.levels:
         facts += _of_level(run, level, summary.levels[level], failing)

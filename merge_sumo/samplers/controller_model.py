@@ -180,7 +180,7 @@ class ModelRollout:
         Returns:
             Signed gaps (`Outcome.signed_gap`), (controllers, N); NaN where the VUT never arrives.
         """
-        if self._criterion.is_papers:
+        if self._criterion.is_of_paper:
             gaps_m, _ = self._play(points, drives)
             return gaps_m.reshape(len(drives), -1) / self.scenario.dx_crash_m
         cases: list[Case] = []

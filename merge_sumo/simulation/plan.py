@@ -144,7 +144,7 @@ class SimulationPlan:
 
     def for_verdicts(self) -> SimulationPlan:
         """Return the plan for verdicts alone: without a follow-up, if they are those of M."""
-        if not self.criterion.is_papers or self.scenario.lane_m is not None:
+        if not self.criterion.is_of_paper or self.scenario.lane_m is not None:
             return self
         return replace(self, scenario=replace(self.scenario, follow_up_s=0.0))
 

@@ -70,6 +70,6 @@ def under(run: RecordedCampaign, criterion: Criterion) -> list[str]:
     judged = []
     for outcome in run.outcomes:
         condition = condition_of(criterion.condition)
-        margin = None if criterion.is_papers else condition.margin(values_of(outcome.measures))
+        margin = None if criterion.is_of_paper else condition.margin(values_of(outcome.measures))
         judged.append(replace(outcome, margin=margin))
     return doubts(judged, criterion, {})
