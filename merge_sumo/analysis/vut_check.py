@@ -60,7 +60,7 @@ class VutCheck(Result):
 
     @property
     def is_good(self) -> bool:
-        """See `Result`."""
+        """Whether the command ends with exit code 0: the same as `ok`."""
         return self.ok
 
     @property
@@ -84,7 +84,8 @@ def check_vut(settings: CampaignSettings) -> VutCheck:
     try:
         plan = settings.load_plan().for_cases(CORRIDORS)
         with _opened(plan) as simulator:
-            timed = simulator.vut = _Timed(simulator.vut)
+            timed = _Timed(simulator.vut)
+            simulator.vut = timed
             problems, notes = _checked(simulator, plan)
             cost_us = timed.us_per_step
     except ControllerError as error:
@@ -98,87 +99,8 @@ def check_vut(settings: CampaignSettings) -> VutCheck:
     )
 
 
-def _opened(plan: SimulationPlan) -> Simulator:
-    try:
-        return Simulator(plan)
-    except UserError as error:
-        raise ControllerError(str(error)) from error
-
-
-def _checked(simulator: Simulator, plan: SimulationPlan) -> tuple[list[str], list[str]]:
-    """Return the faults of the VUT of a simulator, and notes, in sentences."""
-    cases = _ordinary_cases(plan.scenario)
-    from_standstill = replace(cases[0], v_vut0_mps=0.0)
-    problems = []
-    first = simulator.run(cases)
-    wrong = [trajectory for trajectory in first if trajectory.end.is_error]
-    if wrong:
-        problems.append(
-            f"{len(wrong)} of {len(cases)} ordinary cases end as VUT_ERROR, the first at "
-            f"t = {wrong[0].t_end_s} s: {wrong[0].error}"
-        )
-    else:
-        backwards = simulator.run(cases[::-1])[::-1]
-        problems += _differences("the same cases in another order", first, backwards)
-        alone = [simulator.run([case])[0] for case in cases]
-        problems += _differences("each case alone", first, alone)
-        for corridor in range(simulator.simulation.corridors):
-            simulator.vut.begin(corridor, from_standstill)
-        problems += _differences("one more reset", first, simulator.run(cases))
-        if problems:
-            problems.append(
-                "It draws random numbers, reads a clock, or keeps something from earlier episodes: "
-                "in its object (which attributes does `reset` not clear?), its class or its module."
-            )
-    outcomes = [plan.criterion.outcome(one, index=k) for k, one in enumerate(first)]
-    in_vain = Counter(command for one in first for command in one.in_vain)
-    notes = doubts(outcomes, plan.criterion, in_vain)
-    if headline := mostly_clipped(outcomes):
-        notes.insert(0, headline)
-    (last,) = simulator.run([from_standstill])
-    if last.end.is_error:
-        problems.append(
-            f"From standstill it ends as VUT_ERROR at t = {last.t_end_s} s: {last.error}"
-        )
-    elif last.end is End.TIMEOUT and not last.v_vut_mps.any():
-        problems.append("From standstill it never starts, although the road is free at last.")
-    return problems, notes
-
-
-def _ordinary_cases(scenario: Scenario) -> list[Case]:
-    """Return level-0 cases over the start and the speed of the POV."""
-    starts_and_speeds = list(product((0.0, 0.25, 0.5, 0.75), (0.0, 0.3, 0.6, 0.9)))
-    points = np.full((len(starts_and_speeds), len(scenario.dimensions(0))), 0.5)
-    points[:, :2] = starts_and_speeds
-    return from_unit(points, 0, scenario=scenario)
-
-
-class _Timed(DriverWrapper):
-    """Measures the time of a step of one corridor."""
-
-    def __init__(self, driver: Driver) -> None:
-        super().__init__(driver)
-        self.us_per_step: list[float] = []
-
-    def act(self, scene: Scene) -> FloatArray:
-        start_s = perf_counter()
-        answer = self._driver.act(scene)
-        spent_s = perf_counter() - start_s
-        self.us_per_step.append(spent_s * 1e6 / max(int(scene.active.sum()), 1))
-        return answer
-
-
-def _differences(when: str, before: Sequence[Trajectory], after: Sequence[Trajectory]) -> list[str]:
-    """Return a sentence on the first two motions that differ and should be the same, if any."""
-    for one, other in zip(before, after, strict=True):
-        from_s, _ = difference(one, other)
-        if from_s is not None:
-            return [f"After {when} it drives differently from t = {from_s:g} s on."]
-    return []
-
-
 def known_vuts(policies: Path | str | None) -> Shown:
-    """Return the VUTs that can be tested.
+    """Return the VUTs that can be tested: those built in, those installed, and forms of others.
 
     Args:
         policies: folder or library of the learned drivers; None for the shipped ones.
@@ -193,3 +115,102 @@ def known_vuts(policies: Path | str | None) -> Shown:
             record["kinds"].append({"form": kind.form, "what": kind.what, "example": kind.example})
             lines += [kind.form, f"    {kind.what}", f"    {kind.example}"]
     return Shown(record, lines)
+
+
+def _opened(plan: SimulationPlan) -> Simulator:
+    """Start the drivers; a VUT that cannot be started is its own fault, no mistake of the user."""
+    try:
+        return Simulator(plan)
+    except UserError as error:
+        raise ControllerError(str(error)) from error
+
+
+def _checked(simulator: Simulator, plan: SimulationPlan) -> tuple[list[str], list[str]]:
+    """Return the faults of the VUT of a simulator, and notes, in sentences."""
+    cases = _ordinary_cases(plan.scenario)
+    from_standstill = replace(cases[0], v_vut0_mps=0.0)
+    driven = simulator.run(cases)
+    failed = [trajectory for trajectory in driven if trajectory.end.is_error]
+    if failed:
+        problems = [
+            f"{len(failed)} of {len(cases)} ordinary cases end as VUT_ERROR, the first at "
+            f"t = {failed[0].t_end_s} s: {failed[0].error}"
+        ]
+    else:
+        problems = _memory_faults(simulator, cases, driven, from_standstill)
+    notes = _notes(plan, driven)
+    return problems + _standstill_faults(simulator, from_standstill), notes
+
+
+def _memory_faults(
+    simulator: Simulator, cases: list[Case], driven: Sequence[Trajectory], from_standstill: Case
+) -> list[str]:
+    """Return sentences on motions that change when the same cases run again."""
+    backwards = simulator.run(cases[::-1])[::-1]
+    problems = _differences("the same cases in another order", driven, backwards)
+    alone = [simulator.run([case])[0] for case in cases]
+    problems += _differences("each case alone", driven, alone)
+    for corridor in range(simulator.simulation.corridors):
+        simulator.vut.begin(corridor, from_standstill)
+    problems += _differences("one more reset", driven, simulator.run(cases))
+    if problems:
+        problems.append(
+            "It draws random numbers, reads a clock, or keeps something from earlier episodes: "
+            "in its object (which attributes does `reset` not clear?), its class or its module."
+        )
+    return problems
+
+
+def _differences(when: str, before: Sequence[Trajectory], after: Sequence[Trajectory]) -> list[str]:
+    """Return a sentence on the first two motions that differ and should be the same, if any."""
+    for one, other in zip(before, after, strict=True):
+        from_s, _ = difference(one, other)
+        if from_s is not None:
+            return [f"After {when} it drives differently from t = {from_s:g} s on."]
+    return []
+
+
+def _standstill_faults(simulator: Simulator, from_standstill: Case) -> list[str]:
+    """Return a sentence on a VUT that does not drive off, if it does not."""
+    (driven,) = simulator.run([from_standstill])
+    if driven.end.is_error:
+        return [f"From standstill it ends as VUT_ERROR at t = {driven.t_end_s} s: {driven.error}"]
+    if driven.end is End.TIMEOUT and not driven.v_vut_mps.any():
+        return ["From standstill it never starts, although the road is free at last."]
+    return []
+
+
+def _notes(plan: SimulationPlan, driven: Sequence[Trajectory]) -> list[str]:
+    """Return sentences on behaviour that is no fault, but may surprise the author of the VUT."""
+    outcomes = []
+    in_vain: Counter[str] = Counter()
+    for index, trajectory in enumerate(driven):
+        outcomes.append(plan.criterion.outcome(trajectory, index=index))
+        in_vain.update(trajectory.in_vain)
+    clipped = mostly_clipped(outcomes)
+    notes = doubts(outcomes, plan.criterion, in_vain)
+    return notes if clipped is None else [clipped, *notes]
+
+
+def _ordinary_cases(scenario: Scenario) -> list[Case]:
+    """Return 16 level-0 cases over the start and the speed of the POV."""
+    starts_and_speeds = list(product((0.0, 0.25, 0.5, 0.75), (0.0, 0.3, 0.6, 0.9)))
+    points = np.full((len(starts_and_speeds), len(scenario.dimensions(0))), 0.5)
+    # The first two coordinates are start and speed of the POV; all others stay in the middle.
+    points[:, :2] = starts_and_speeds
+    return from_unit(points, 0, scenario=scenario)
+
+
+class _Timed(DriverWrapper):
+    """Measures the time of each step, divided by the number of episodes that it drives, in us."""
+
+    def __init__(self, driver: Driver) -> None:
+        super().__init__(driver)
+        self.us_per_step: list[float] = []
+
+    def act(self, scene: Scene) -> FloatArray:
+        start_s = perf_counter()
+        answer = self._driver.act(scene)
+        spent_s = perf_counter() - start_s
+        self.us_per_step.append(spent_s * 1e6 / max(int(scene.active.sum()), 1))
+        return answer

@@ -43,7 +43,7 @@ FIRST_REPORT_S = 2.0
 """Time after which the report of a running campaign first appears, in s."""
 REPORT_EVERY_S = 5
 """Minimum time between two reports of a running campaign, in s."""
-MOST_REPORTS_SHARE = 0.1
+REPORTS_SHARE = 0.1
 """Maximum share of the time of a campaign for its reports."""
 
 
@@ -170,7 +170,7 @@ class RunningReport:
             return
         self._is_there = self._write(running=True)
         took_s = time.monotonic() - start_s
-        self._due_s = start_s + max(REPORT_EVERY_S, took_s / MOST_REPORTS_SHARE)
+        self._due_s = start_s + max(REPORT_EVERY_S, took_s / REPORTS_SHARE)
         if not self._is_there:
             self._due_s = math.inf  # no second try: the last report gives the reason
 

@@ -1,6 +1,6 @@
-"""Sentences and lines of a terminal on campaigns, cases and studies.
+"""Write results as sentences and lines for a terminal: begin at the functions of `lines_of`.
 
-`lines_of` has a function for each type of result.
+Each writes one type of result. `headline`, `causes` and `episode_lines` write campaigns and cases.
 """
 
 from __future__ import annotations
@@ -107,7 +107,7 @@ def headline(run: RecordedCampaign, facts: Sequence[Fact]) -> list[str]:
 
     Args:
         run: the campaign.
-        facts: its facts, which have all numbers of the lines.
+        facts: its facts, as `facts_of` returns them; the lines have no other numbers.
     """
     of = {fact.name: fact for fact in facts if fact.level is None}
     levels = by_level(facts)
@@ -115,31 +115,22 @@ def headline(run: RecordedCampaign, facts: Sequence[Fact]) -> list[str]:
     if AT_MOST in of:
         cases = f"{of[CASES].shown} of {of[AT_MOST].shown} cases, converged"
     lines = [f"{of[VUT].shown}: {RULE} {of[RULE].shown}; {cases}"]
-    rows = []
-    is_measured = PROBABILITY_TO_FAIL in of
-    for level, row in levels.items():
-        is_measured |= STARTS_THAT_FAIL in row
-        rows.append(_level_cells(level, row))
-    for line in aligned(rows):
+    for line in aligned([_level_cells(level, row) for level, row in levels.items()]):
         lines.append(f"  {line}")
 
     remarks = []
     if CONTACT in of:
         contacts = _counted(of[CONTACT], "more case")
         remarks.append(f"contact after the merge in {contacts}: `fail_when` unsafe counts them")
-    if not is_measured:
+    has_shares = any(STARTS_THAT_FAIL in row for row in levels.values())
+    if not has_shares and PROBABILITY_TO_FAIL not in of:
         measure = campaign_command("probability", run.folder, run.record)
         remarks.append(f"{STARTS_THAT_FAIL} are not measured: {measure}")
     if remarks:
         lines.append("; ".join(remarks))
 
     if AVOIDED_BY_POV in of:
-        number = _counted(of[FAILURES], "failure")
-        if DRIVEN in of:
-            number = f"{of[DRIVEN].shown} of {number}"
-        drivers = [f"{name} {of[AVOIDED.format(name)].shown}" for name in REFERENCE_DRIVERS]
-        pov = f"by a careful POV {of[AVOIDED_BY_POV].shown}"
-        lines.append(f"avoided of {number}: by driver {', '.join(drivers)}, {pov}")
+        lines.append(_avoided(of))
     if WORST in of:
         replay = command("replay", run.folder, of[WORST].value, gui=True)
         lines.append(f"{WORST} ({of[KIND].shown}): {replay}")
@@ -150,21 +141,30 @@ def _counted(fact: Fact, what: str) -> str:
     return f"{fact.shown} {what}" if fact.value == 1 else f"{fact.shown} {what}s"
 
 
+def _avoided(of: Mapping[str, Fact]) -> str:
+    """Return how many failures each reference driver, and a careful POV, would have avoided."""
+    number = _counted(of[FAILURES], "failure")
+    if DRIVEN in of:
+        number = f"{of[DRIVEN].shown} of {number}"
+    drivers = [f"{name} {of[AVOIDED.format(name)].shown}" for name in REFERENCE_DRIVERS]
+    pov = f"by a careful POV {of[AVOIDED_BY_POV].shown}"
+    return f"avoided of {number}: by driver {', '.join(drivers)}, {pov}"
+
+
 def _level_cells(level: int, of: Mapping[str, Fact]) -> list[str]:
     """Return level, share of starts, failures, regions and FMC as text; "" for none."""
-    cells = [f"level {level_name(level)}", "", "nothing tested", "", ""]
+    share, failures, regions, coverage = "", "nothing tested", "", ""
     if STARTS_THAT_FAIL in of:
-        cells[1] = f"{of[STARTS_THAT_FAIL].shown} of all starts fail, by {of[STARTS].shown}"
+        share = f"{of[STARTS_THAT_FAIL].shown} of all starts fail, by {of[STARTS].shown}"
     if FAILURES in of:
-        cells[2] = f"{_counted(of[FAILURES], 'failure')} found"
+        failures = f"{_counted(of[FAILURES], 'failure')} found"
         if UNDECIDED in of and of[UNDECIDED].value:
-            cells[2] += f", {of[UNDECIDED].shown} undecided"
+            failures += f", {of[UNDECIDED].shown} undecided"
         if of[FMC].value:
-            regions = of[REGIONS]
-            is_number = regions.value != SCATTERED
-            cells[3] = _counted(regions, "region") if is_number else SCATTERED
-            cells[4] = f"FMC {of[FMC].shown}"
-    return cells
+            is_number = of[REGIONS].value != SCATTERED
+            regions = _counted(of[REGIONS], "region") if is_number else SCATTERED
+            coverage = f"FMC {of[FMC].shown}"
+    return [f"level {level_name(level)}", share, failures, regions, coverage]
 
 
 # Comparisons
@@ -180,6 +180,7 @@ def change_in_words(case: ComparedCase) -> str:
         shares = f"{case.earlier_runs.in_words} -> {case.later_runs.in_words}"
         return f"{shares}, by Fisher's exact test p = {case.p_value:.2g}"
     words = [outcome_word(case.earlier), outcome_word(case.later)]
+    # Equal words do not show the change: add the margins where both may pass, else the verdicts.
     if words[0] == words[1] and case.change is not Change.BOTH:
         for place, outcome in enumerate((case.earlier, case.later)):
             if case.change in (Change.WORSE, Change.NOT_REPEATABLE):
@@ -241,7 +242,7 @@ def fmc_rows(compared: Comparison) -> dict[int, list[str]]:
 
 
 @lines_of.register
-def comparison(compared: Comparison) -> list[str]:
+def comparison_lines(compared: Comparison) -> list[str]:
     """Return the numbers of each version and each change, and the first of the cases.
 
     Args:
@@ -312,7 +313,7 @@ def truth_remarks(truth: Truth) -> list[str]:
 
 
 @lines_of.register
-def truths(found: TruthResult) -> list[str]:
+def truth_lines(found: TruthResult) -> list[str]:
     """Return a line for each level, and the criterion.
 
     Args:
@@ -339,8 +340,8 @@ def truths(found: TruthResult) -> list[str]:
 
 def _spread(spread: Spread, form: str) -> str:
     """Return the median, with the quartiles in brackets."""
-    median, low, high = (_cell(one, form) for one in (spread.median, spread.low, spread.high))
-    return f"{median} [{low}, {high}]"
+    quartiles = f"{_cell(spread.low, form)}, {_cell(spread.high, form)}"
+    return f"{_cell(spread.median, form)} [{quartiles}]"
 
 
 def _cell(value: float | None, form: str) -> str:
@@ -348,7 +349,7 @@ def _cell(value: float | None, form: str) -> str:
 
 
 @lines_of.register
-def samplers(study: SamplerStudy) -> list[str]:
+def sampler_lines(study: SamplerStudy) -> list[str]:
     """Return truth and limit, and a table of the samplers: medians [quartiles].
 
     Args:
@@ -388,7 +389,7 @@ def samplers(study: SamplerStudy) -> list[str]:
 
 
 @lines_of.register
-def reproduction(found: Reproduction) -> list[str]:
+def reproduction_lines(found: Reproduction) -> list[str]:
     """Return Table II as Markdown: our medians, with the paper's numbers in brackets.
 
     Args:
@@ -441,11 +442,14 @@ def _fmc_of(study: SamplerStudy) -> dict[str, float | None]:
         values[f"{name} / limit"] = study.samplers[name].fmc_over_limit.median
     for name in ADAPTIVE:
         one = study.samplers[name]
-        # A quarter of all cases, or the end of the batch that has it.
-        batch = next(k for k, n in enumerate(one.cases_by_batch) if n >= one.cases_by_batch[-1] / 4)
-        is_known = study.truth_fmc and not study.is_small
-        share = one.fmc_by_batch[1][batch] / study.truth_fmc if is_known else None
-        values[f"{name} / truth after {one.cases_by_batch[batch]} cases"] = share
+        batch = 0  # becomes the first one after which a quarter of all cases has run
+        while one.cases_by_batch[batch] < one.cases_by_batch[-1] / 4:
+            batch += 1
+        row = f"{name} / truth after {one.cases_by_batch[batch]} cases"
+        values[row] = None
+        if study.truth_fmc and not study.is_small:
+            _, medians, _ = one.fmc_by_batch
+            values[row] = medians[batch] / study.truth_fmc
     return values
 
 
@@ -453,7 +457,7 @@ def _fmc_of(study: SamplerStudy) -> dict[str, float | None]:
 
 
 @lines_of.register
-def probability(found: ProbabilityResult) -> list[str]:
+def probability_lines(found: ProbabilityResult) -> list[str]:
     """Return the probability and its interval, the strata, the levels, and the counted cases.
 
     Args:
@@ -475,6 +479,7 @@ def probability(found: ProbabilityResult) -> list[str]:
         for level, estimate in found.levels.items():
             lines.append(f"  level {level_name(level)}: P(fail) {_interval(estimate)}")
     criterion = Criterion(found.campaign["fail_when"], found.campaign["require"])
+    # The result has the scenario as in its file; the clause needs only this number of it.
     scenario = replace(US23, dx_crash_m=found.campaign["scenario"]["dx_crash_m"])
     lines.append(f"  a case fails when {criterion.description(scenario)}")
     if found.without_verdict:
@@ -504,7 +509,7 @@ def _per_merge(one: PerMerge, at: str) -> list[str]:
 
 
 @lines_of.register
-def stress(found: StressResult) -> list[str]:
+def stress_lines(found: StressResult) -> list[str]:
     """Return a table of the rungs, and the robust failures.
 
     Args:
@@ -513,6 +518,7 @@ def stress(found: StressResult) -> list[str]:
     lines = [
         f"{counted(found.cases, 'case')} of {found.vut}, {len(found.failures)} of them "
         f"failures, {found.runs} times each",
+        # The columns of the rows below: 8, 10, 10 and 12 characters wide.
         "   flips  now pass  now fail  no verdict  what is changed",
     ]
     for rung in found.rungs:
@@ -548,7 +554,7 @@ def robustness(found: StressResult) -> str:
 
 
 @lines_of.register
-def explanation(result: ExplanationResult) -> list[str]:
+def explanation_lines(result: ExplanationResult) -> list[str]:
     """Return the failure, its cause, its changes, and a command that runs the smallest change.
 
     Args:
@@ -612,7 +618,7 @@ def _axis(axis: Axis, name: str, unit: str) -> str:
 
 
 @lines_of.register
-def vut_check(found: VutCheck) -> list[str]:
+def vut_check_lines(found: VutCheck) -> list[str]:
     """Return the problems in sentences, and the cost of a step.
 
     Args:
@@ -678,6 +684,7 @@ def episode_lines(
 
 
 def _measures(outcome: Outcome) -> Iterator[str]:
+    """Yield a line for each measure with a label, of the car that the VUT meets, and the faults."""
     found, scenario = outcome.measures, outcome.case.scenario
     car = conflicting_car(found)
     if car != "POV":
