@@ -92,7 +92,7 @@ from merge_sumo.simulation.povs import parse_levels, policies_folder
 from merge_sumo.sumo import replay as replayer
 from merge_sumo.sumo.binding import scratch_folder
 from merge_sumo.sumo.replay import Replay, check_display
-from merge_sumo.sumo.replay_folder import CONFIG, write_scenario
+from merge_sumo.sumo.replay_folder import CONFIG, write_replay_folder
 from merge_sumo.workers import open_workers
 
 if TYPE_CHECKING:
@@ -223,7 +223,7 @@ def run(config: c.RunCase) -> CaseRun:
         if folder is None and config.gui:
             folder = opened.enter_context(scratch_folder()) / "case"
         if folder is not None:
-            write_scenario(folder, plan.road, episode.outcome, episode.trajectory)
+            write_replay_folder(folder, plan.road, episode.outcome, episode.trajectory)
         if config.on_end is not None:
             config.on_end(result)
         if folder is not None and config.gui:

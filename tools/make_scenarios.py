@@ -23,7 +23,7 @@ from merge_sumo.scenario.case import Case
 from merge_sumo.scenario.scenario import COLOURS, DT_S, US23, Scenario
 from merge_sumo.scenario.trajectory import Trajectory
 from merge_sumo.simulation.simulator import Simulator
-from merge_sumo.sumo.replay_folder import write_scenario
+from merge_sumo.sumo.replay_folder import write_replay_folder
 
 STYLES: dict[str, dict[str, Any]] = {
     "POV": {"color": COLOURS["pov"]},
@@ -128,7 +128,7 @@ def main() -> None:
         road = road_for(case.scenario)
         measures = Measures.of(trajectory, centre_lines(road))
         outcome = Outcome(0, 0, case, measures)
-        write_scenario(folder, road, outcome, trajectory)
+        write_replay_folder(folder, road, outcome, trajectory)
         pov = f"POV level {case.level}" + ("" if case.svo_rad is None else f" psi {case.svo_rad}")
         dx = "" if measures.dx_m is None else f", dx {measures.dx_m:.1f} m"
         if case.scenario.vehicles > 2:

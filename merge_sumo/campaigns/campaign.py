@@ -35,7 +35,7 @@ from merge_sumo.samplers.registry import SAMPLERS
 from merge_sumo.scenario.case import Pool
 from merge_sumo.simulation.evaluate import open_simulators
 from merge_sumo.simulation.plan import SimulationPlan, differences
-from merge_sumo.sumo.replay_folder import write_scenario
+from merge_sumo.sumo.replay_folder import write_replay_folder
 from merge_sumo.workers import Workers
 
 EXPORTED_FAILURES = 10
@@ -245,4 +245,4 @@ def export_case(run: RecordedCampaign, index: int, folder: Path, road: Road | No
         The path of the SUMO configuration.
     """
     road = road or road_for(run.scenario)
-    return write_scenario(folder, road, run.outcome(index), run.trajectory(index))
+    return write_replay_folder(folder, road, run.outcome(index), run.trajectory(index))

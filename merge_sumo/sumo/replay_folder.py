@@ -1,13 +1,13 @@
 """Write an episode as a folder that sumo and sumo-gui play without merge-sumo.
 
-The folder has the net of the paper's scenario, or for another road the net of `net_copies` with one
-copy, whose lanes have known ids, continue beyond the net file and limit no speed.
+`write_replay_folder` writes all files. On the road of us23 the folder has the shipped net. On
+another road it has a net of the two paths alone, without speed limits (`net_copies`).
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Sequence, Set
 from dataclasses import dataclass, replace
 from operator import attrgetter
 from pathlib import Path
@@ -30,6 +30,7 @@ from merge_sumo.scenario.trajectory import Trajectory
 from merge_sumo.sumo.net_copies import COPY, LANE, hosted_net
 
 CONFIG = "replay.sumocfg"
+"""The file that sumo and sumo-gui open."""
 NET = "us23.net.xml"
 """Net of the paper's scenario."""
 HOSTED_NET = "road.net.xml"
@@ -55,10 +56,23 @@ REAL_TIME_MS = "1000"
 HOLD_STEPS = 10
 """Number of rows of a record that repeat the last one, so that the last picture stays."""
 NAMES = {"pov": "POV", "vut": "VUT", "ahead": "car ahead", "behind": "car behind"}
+"""Names of the vehicles in the legend."""
 TEXT = "text"
 """Parameter of a point of interest that sumo-gui shows."""
 PALE = "0.93,0.93,0.90"
+"""Red, green and blue of the background, from 0 to 1."""
 INK = "0.1,0.1,0.1"
+"""Red, green and blue of texts."""
+FIRST_LINE_UP = 0.465
+"""Distance of the first line of the labels from the middle, as a share of the view's height."""
+LINE_DOWN = 0.035
+"""Distance of two lines, as a share of the view's height."""
+LEGEND_UP = 0.315
+"""Distance of the legend from the middle, as a share of the view's height."""
+LEGEND_RIGHT = 0.13
+"""Distance of two entries of the legend, as a share of the view's width."""
+DOT = 0.012
+"""Size of a dot of the legend, as a share of the view's width."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,7 +101,7 @@ class View:
         return self.x_m + right * self.width_m, self.y_m + up * self.width_m * SHAPE
 
 
-def write_scenario(folder: Path, road: Road, outcome: Outcome, trajectory: Trajectory) -> Path:
+def write_replay_folder(folder: Path, road: Road, outcome: Outcome, trajectory: Trajectory) -> Path:
     """Write an episode as a replay folder.
 
     Args:
@@ -104,10 +118,11 @@ def write_scenario(folder: Path, road: Road, outcome: Outcome, trajectory: Traje
 
     Example:
         >>> outcome, trajectory = run.outcomes[0], run.trajectory(0)
-        >>> write_scenario(Path("case"), road_for(run.scenario), outcome, trajectory)
+        >>> write_replay_folder(Path("case"), road_for(run.scenario), outcome, trajectory)
         PosixPath('case/replay.sumocfg')
     """
     road = _road_of_folder(road, folder)
+    # The folder has its own net: no path of this machine.
     scenario = outcome.case.scenario.to_record() | {"net": None}
     case = to_json({SCENARIO: scenario, **outcome.to_record()}, indent=2)
     record = motion_record(road, trajectory)
@@ -151,21 +166,25 @@ def road_of_hosted(content: bytes, path: Path, lane_m: Bounds | None) -> Road:
     """
     net = read_net(path, content)
     names = set(net.edges)
-    paths: dict[str, list[str]] = {"main": [], "ramp": [], "out": []}
-    for number in range(1, len(names) + 1):
-        for name, edges in paths.items():
-            if f"{name}{number}.0" in names:
-                edges.append(f"{name}{number}.0")
-    main, ramp, out = paths.values()
+    main, ramp, out = (_numbered(part, names) for part in ("main", "ramp", "out"))
+    if not ramp:  # all vehicles are on one path
+        ramp = main
     lane = [] if lane_m is None else [LANE_EDGE]
     return find_road(
         net,
         main + lane + out,
-        (ramp or main) + lane + out,  # without a ramp all vehicles are on one path
+        ramp + lane + out,
         room_after_m=0.0,
         edge_at_m=out[0] if out else None,
-        lane_m=lane_m and (lane_m[1], lane_m[1]),
+        # The end alone: the lane of the net may begin anywhere before it.
+        lane_m=None if lane_m is None else (lane_m[1], lane_m[1]),
     )
+
+
+def _numbered(part: str, names: Set[str]) -> list[str]:
+    """Return the edges of a part of a hosted road in driving order: main1.0, main2.0, ..."""
+    candidates = [f"{part}{number}.0" for number in range(1, len(names) + 1)]
+    return [name for name in candidates if name in names]
 
 
 def files_of(
@@ -282,6 +301,7 @@ def _view_of(road: Road, record: etree._Element) -> View:
         driven.append((float(car.get("x", "")), float(car.get("y", ""))))
     whole_m, _ = _box(net)
     driven_m, (x_m, y_m) = _box(driven)
+    # The way of the VUT fills 1 / 1.3 of the width, a way below 100 m less.
     width_m = 1.3 * max(driven_m, 100.0)
     return View(f"{100.0 * whole_m / width_m:.0f}", round(x_m), round(y_m), width_m)
 
@@ -290,6 +310,7 @@ def _box(points: Sequence[tuple[float, float]]) -> tuple[float, FloatArray]:
     """Return the width of a view that has points below the labels, and its middle."""
     low, high = np.min(points, axis=0), np.max(points, axis=0)
     width_m, height_m = (high - low).tolist()
+    # The labels take a fifth of the height.
     return max(width_m, height_m / (0.8 * SHAPE)), (low + high) / 2.0
 
 
@@ -326,15 +347,18 @@ def _labels(outcome: Outcome, trajectory: Trajectory, view: View) -> etree._Elem
     words = cause(outcome, trajectory).removesuffix(".")
     if outcome.measures.end.is_error:
         words = words.partition(":")[0]  # without the message, which may hold anything
+    # One line for each clause: after a colon, and at the end of a sentence.
     lines = [case_line(outcome.case, outcome.index), *re.split(r"(?<=:) |\. ", words)]
     root = etree.Element("additional")
     # Lines from the top of the view downwards, and the legend in a row below them.
     for number, line in enumerate(lines[:4]):
-        _label(root, f"line{number}", view.place(0.0, 0.465 - 0.035 * number), line)
+        at = view.place(0.0, FIRST_LINE_UP - LINE_DOWN * number)
+        _label(root, f"line{number}", at, line)
     cars = VEHICLES[: outcome.case.scenario.vehicles]
     for number, name in enumerate(cars):
-        at = view.place(0.13 * (number - 0.5 * (len(cars) - 1)), 0.315)
-        _label(root, name, at, NAMES[name], COLOURS[name], 0.012 * view.width_m)
+        from_middle = number - 0.5 * (len(cars) - 1)
+        at = view.place(LEGEND_RIGHT * from_middle, LEGEND_UP)
+        _label(root, name, at, NAMES[name], COLOURS[name], DOT * view.width_m)
     return root
 
 

@@ -13,7 +13,7 @@ from merge_sumo.scenario.case import Case
 from merge_sumo.scenario.scenario import DT_S
 from merge_sumo.scenario.trajectory import End, Trajectory
 from merge_sumo.sumo.replay import replay
-from merge_sumo.sumo.replay_folder import HOLD_STEPS, write_scenario
+from merge_sumo.sumo.replay_folder import HOLD_STEPS, write_replay_folder
 
 
 def commanded(
@@ -33,7 +33,7 @@ def commanded(
 
 def write_replay(folder: Path, road: Road, trajectory: Trajectory) -> Path:
     outcome = Outcome(0, 0, trajectory.case, Measures.of(trajectory))
-    write_scenario(folder, road, outcome, trajectory)
+    write_replay_folder(folder, road, outcome, trajectory)
     return folder
 
 
