@@ -24,20 +24,37 @@ MAX_ELEMENTS = 4_000_000
 GZIP = b"\x1f\x8b"
 """First bytes of a gzip file."""
 NET_TAGS = frozenset(
-    {
-        *("net", "location", "edge", "lane", "junction", "request", "connection", "roundabout"),
-        *("tlLogic", "phase"),
-    }
+    (
+        "net",
+        "location",
+        "edge",
+        "lane",
+        "junction",
+        "request",
+        "connection",
+        "roundabout",
+        "tlLogic",
+        "phase",
+    )
 )
 """Elements of a net that describe the road. Only a location can name a file, in its projection."""
 RECORD_TAGS = frozenset(("fcd-export", "timestep", "vehicle"))
 """Elements of floating car data."""
 PROJECTION = re.compile(
-    r"[!.-]|(\+(no_defs|south|(proj|zone|ellps|datum|units|lat_0|lat_1|lat_2|lat_ts|lon_0|k|k_0"
-    r"|x_0|y_0|type|towgs84)=[\w.,-]{1,80})( |$))+",
-    re.ASCII,
+    r"""
+    [!.-]                    # none, UTM or simple: SUMO's short forms
+    | ( \+                   # or parameters of PROJ, such as "+proj=utm +zone=32"
+        ( no_defs | south
+        | (proj|zone|ellps|datum|units|lat_0|lat_1|lat_2|lat_ts|lon_0|k|k_0|x_0|y_0|type|towgs84)
+          =[\w.,-]{1,80}     # no "/": no file
+        ) ([ ]|$)
+      )+
+    """,
+    re.ASCII | re.VERBOSE,
 )
 """Projections that do not name a file."""
+NO_PROJECTION = "!"
+"""SUMO's word for coordinates without a projection."""
 
 
 def read_xml(path: Path, what: str) -> bytes:
@@ -57,6 +74,7 @@ def read_xml(path: Path, what: str) -> bytes:
         content = read_limited(path, MAX_BYTES)
         if content.startswith(GZIP):
             with gzip.open(io.BytesIO(content)) as packed:
+                # One byte more than allowed, which tells that there is more.
                 content = packed.read(MAX_BYTES + 1)
     except (gzip.BadGzipFile, EOFError, zlib.error) as error:
         raise UserError(f"cannot unpack {what} {path} ({error}): copy or pack it again") from error
@@ -68,12 +86,12 @@ def read_xml(path: Path, what: str) -> bytes:
     return content
 
 
-def parse_xml(content: bytes, name: str, tags: frozenset[str]) -> etree._Element:
+def parse_xml(content: bytes, what: str, tags: frozenset[str]) -> etree._Element:
     """Parse an XML file and keep the elements with some tags.
 
     Args:
         content: the unpacked content of the file.
-        name: its description in messages, such as "the net a.net.xml".
+        what: its description in messages, such as "the net a.net.xml".
         tags: the tags to keep. The root is always kept.
 
     Returns:
@@ -91,9 +109,9 @@ def parse_xml(content: bytes, name: str, tags: frozenset[str]) -> etree._Element
     try:
         content.decode("utf-8")
     except UnicodeDecodeError as error:
-        raise UserError(f"{name} is not readable XML: save it as UTF-8") from error
+        raise UserError(f"{what} is not readable XML: save it as UTF-8") from error
     if b"<!DOCTYPE" in content or b"<!ENTITY" in content:
-        raise UserError(f"{name} declares a document type or an entity: remove the declaration")
+        raise UserError(f"{what} declares a document type or an entity: remove the declaration")
     elements = etree.iterparse(
         io.BytesIO(content),
         # Another encoding, which the file may declare, could hide an entity from the check above.
@@ -108,12 +126,12 @@ def parse_xml(content: bytes, name: str, tags: frozenset[str]) -> etree._Element
     try:
         for number, (_, element) in enumerate(elements, start=1):
             if number > MAX_ELEMENTS:
-                raise UserError(f"{name} has more than {MAX_ELEMENTS} elements")
+                raise UserError(f"{what} has more than {MAX_ELEMENTS} elements")
             if element.tag not in tags:
-                element.clear()
+                element.clear()  # at once, to save memory; it is removed below
     except etree.XMLSyntaxError as error:
         reason = str(error.msg).encode("ascii", "backslashreplace").decode()
-        raise UserError(f"{name} is not readable XML: {reason:.200}") from error
+        raise UserError(f"{what} is not readable XML: {reason:.200}") from error
     root: etree._Element = elements.root
     unwanted = {element.tag for element in root.iter()} - tags
     etree.strip_elements(root, *unwanted, with_tail=False)
@@ -130,15 +148,15 @@ def harmless_net(path: Path) -> etree._Element:
         The root of the net.
 
     Raises:
-        UserError: the file cannot be read.
+        UserError: it cannot be read, or is not a net, as in `read_xml` and `parse_xml`.
     """
     root = parse_xml(read_xml(path, "the net"), f"the net {path}", NET_TAGS)
     for name in map(str, root.keys()):
         if name.startswith("{"):
             del root.attrib[name]  # the address of a schema
     for location in root.iterfind("location"):
-        if not PROJECTION.fullmatch(location.get("projParameter", "!")):
-            location.set("projParameter", "!")
+        if not PROJECTION.fullmatch(location.get("projParameter", NO_PROJECTION)):
+            location.set("projParameter", NO_PROJECTION)
     return root
 
 
