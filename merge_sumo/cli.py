@@ -70,6 +70,18 @@ FIELDS: Mapping[str, Parameter] = {
 SEARCH, LOOK, CHANGE, OWN, RESEARCH = map(
     Group.create_ordered, ("Search", "Look", "Change", "Bring your own", "Research")
 )
+GONE: Mapping[str, str] = {
+    "board": "`merge-sumo report` prints on A4, and `report --json` has each fact with its source",
+    "crosscheck": "`python tools/crosscheck.py RUN`, in a checkout, repeats cases in HighwayEnv",
+    "policies": "`python tools/export_policy.py NAME FILE`, in a checkout, writes an ONNX network",
+    "compare-runs": "`merge-sumo compare RUN RUN...` compares what is recorded",
+    "history": "`merge-sumo compare RUN RUN...` compares any number of recorded versions",
+    "stress": "`merge-sumo rerun RUN --stress` does it",
+    "repair": "`examples/repair.py`, in a checkout, searches by optuna and `merge_sumo.rerun`",
+    "certify": "after a campaign without failures, `merge-sumo probability RUN --cases 100000` "
+    "bounds how much of the pool can fail",
+}
+"""What replaces a command of an earlier version, by its name."""
 FAULT = 70
 """Exit code of a fault of this package, as EX_SOFTWARE of sysexits.h."""
 
@@ -419,6 +431,8 @@ def execute(words: Sequence[str]) -> int:
     Raises:
         UserError: for bad use.
     """
+    if words and words[0] in GONE:
+        raise UserError(f"the command {words[0]} is gone: {GONE[words[0]]}")
     try:
         with notices_printed():
             return app(words) or 0
