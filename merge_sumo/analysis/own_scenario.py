@@ -9,8 +9,6 @@ from pathlib import Path
 from merge_sumo import config
 from merge_sumo.campaigns.scenario_suggestion import (
     about,
-    kind_of_merge,
-    lane_warnings,
     suggested,
     suggested_lane_m,
     unseen,
@@ -58,7 +56,7 @@ def write_scenario(options: config.NewScenario) -> Shown:
     road = road_of(net, *edges)
     if not options.point:
         road = road_of(net, *edges, lane_m=suggested_lane_m(road))
-    scenario, found = suggested(road, file.stem), [*about(road), *kind_of_merge(road)]
+    scenario, found = suggested(road, file.stem), about(road)
     relative = os.path.relpath(net.resolve(), file.parent.resolve())
     write_new(picture, road_svg(road, scenario), "FILE")
     write_new(file, to_toml(replace(scenario, net=relative), found).encode(), "FILE")
@@ -76,8 +74,7 @@ def check_scenario(scenario: Scenario, name: str, policies: Path | None) -> Show
     """
     road = road_for(scenario)
     sentences, differing = about(road), unseen(scenario, policies)
-    warnings = lane_warnings(scenario, road)
-    lines = [*sentences, *(f"warning: {sentence}" for sentence in warnings)]
+    lines = sentences.copy()
     if differing:
         made = quoted(f"{scenario.name}-policies")
         lines += [
@@ -90,4 +87,4 @@ def check_scenario(scenario: Scenario, name: str, policies: Path | None) -> Show
         lines.append(
             "the learned drivers (levels 1 and 2) were trained on such starts, or like ones"
         )
-    return Shown({"about": sentences, "warnings": warnings, "unseen": differing}, lines)
+    return Shown({"about": sentences, "unseen": differing}, lines)

@@ -1,4 +1,4 @@
-"""A suggested scenario for a road, and warnings about a scenario before it is run."""
+"""A suggested scenario for a road, and sentences about a scenario before it is run."""
 
 from __future__ import annotations
 
@@ -11,15 +11,13 @@ import numpy as np
 
 from merge_sumo.drivers.level0 import level0_time_to
 from merge_sumo.drivers.policies import policies_of, read_manifest, scenario_of
-from merge_sumo.road.road import MAX_LANE_M, MIN_LANE_M, LanePath, Road, lane_around_m
+from merge_sumo.road.road import LanePath, Road, lane_around_m
 from merge_sumo.scenario.scenario import MAX_EPISODE_S, US23, V_VUT0_MPS, Bounds, Scenario, Units
 
 MARGIN: Final = 0.15
 """The pool reaches this far beyond the starts from which both vehicles meet at M."""
 SLOWEST: Final = 0.7
 """Of the speed limit: the mainline drives at least so fast."""
-SAME_M = 0.05
-"""Coordinates that differ by less are written alike."""
 ROOM: Final = 0.98
 """Of the length of a path that is used."""
 BEFORE_GORE_M: Final = 50.0
@@ -41,46 +39,6 @@ def suggested_lane_m(road: Road) -> Bounds | None:
     """
     lane = road.acceleration_lane
     return lane_around_m(lane.length_m) if lane is not None and lane.gives_a_choice else None
-
-
-def kind_of_merge(road: Road) -> list[str]:
-    """Return which kind of merge a road is taken for, and why, in sentences.
-
-    Args:
-        road: the road.
-    """
-    if road.is_one_path:
-        return []
-    lane = road.acceleration_lane
-    if lane is None:
-        why = (
-            "the lane that ends is that of the mainline (exchange `mainline` and `ramp`?)"
-            if road.lane_drop
-            else "ramp and mainline have no lanes side by side before it"
-        )
-        return [f"kind: merge at the point M, because {why}"]
-    lanes = (
-        f"{' '.join(lane.lanes)} of the ramp runs next to {' '.join(lane.mainline_lanes)} of the "
-        f"mainline for {lane.length_m:.1f} m"
-    )
-    if road.lane_m is not None:
-        mark = ", and the net marks it" if lane.is_marked else ""
-        lines = [f"kind: acceleration lane, because {lanes}{mark}; `point` makes M a point"]
-    elif lane.gives_a_choice:
-        lines = [f"kind: merge at the point M, as asked for, although {lanes}"]
-    else:
-        why = (
-            f"more than {MAX_LANE_M:g} m"
-            if lane.length_m > MAX_LANE_M
-            else f"less than {MIN_LANE_M:g} m, and the net does not mark it"
-        )
-        lines = [f"kind: merge at the point M, because {lanes}: {why}"]
-    if lane.exits:
-        lines.append(
-            f"weaving: the lane continues to {' and '.join(lane.exits)}; the VUT has to leave it "
-            "before, and traffic that leaves there is not simulated"
-        )
-    return lines
 
 
 def suggested(road: Road, name: str) -> Scenario:
@@ -168,14 +126,13 @@ def about(road: Road) -> list[str]:
     merge = f"M: lane {m.lane} at ({m.x_m:.1f}, {m.y_m:.1f})"
     if road.is_one_path:
         return [*lines, merge]
-    if road.lane_m is not None and (lane := road.acceleration_lane) is not None:
-        begin_m, end_m = road.lane_m
-        ends = f"from {lane.begin_m:.1f} m, the gore, to {lane.end_m:.1f} m"
-        if begin_m > lane.begin_m + SAME_M:
-            ends += f", used from {begin_m:.1f} m on"
-        share = -begin_m / (end_m - begin_m)
-        merge += f", where a merge is expected, at a share of {share:.2f} of the acceleration lane"
-        return [*lines, f"acceleration lane: {' '.join(lane.lanes)}, {ends}", merge]
+    lane = road.acceleration_lane
+    if lane is not None:
+        ends = f"{' '.join(lane.lanes)}, from {lane.begin_m:.1f} m, the gore, to {lane.end_m:.1f} m"
+        if road.lane_m is not None:
+            merge += ", where a merge is expected"
+            return [*lines, f"acceleration lane: {ends}", merge]
+        lines.append(f"lane next to the mainline, not used as an acceleration lane: {ends}")
     lines.append(f"{merge}, junction {road.junction_type}")
     yields = road.mainline_approach.yields, road.ramp_approach.yields
     first = {(True, False): "the ramp goes", (False, True): "the mainline goes"}
@@ -183,32 +140,6 @@ def about(road: Road) -> list[str]:
     if road.lane_drop:
         lines.append("one path comes to M on a lane that ends")
     return lines
-
-
-def lane_warnings(scenario: Scenario, road: Road) -> list[str]:
-    """Return sentences on an acceleration lane that a scenario does not use, or only in part.
-
-    Args:
-        scenario: the scenario.
-        road: its road.
-    """
-    lane = road.acceleration_lane
-    if lane is None or not lane.gives_a_choice:
-        return []
-    sentences = []
-    if road.lane_m is None:
-        sentences.append(
-            f"the ramp has an acceleration lane, {' '.join(lane.lanes)}, of {lane.length_m:.0f} m; "
-            "M is a point at its end: `merge-sumo scenario new` writes a scenario in which the VUT "
-            "chooses where to merge on it"
-        )
-    on_lane_m = scenario.x_vut0_m - lane.begin_m
-    if on_lane_m > 0.0:
-        sentences.append(
-            f"the VUT starts on the acceleration lane, {on_lane_m:.0f} m behind its gore at "
-            f"{lane.begin_m:.1f} m"
-        )
-    return sentences
 
 
 ALIKE: Final = 0.25

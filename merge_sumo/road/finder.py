@@ -382,21 +382,13 @@ def _acceleration_lane(
     main, ramp = along
     if not ramp or meeting.ending == MAINLINE:
         return None
-    link = meeting.links[RAMP]
-    end_m = lane_m[1] if lane_m else -_length_m(link.via)
+    end_m = lane_m[1] if lane_m else -_length_m(meeting.links[RAMP].via)
     lanes = [net.getLane(piece.lane) for piece in ramp]
-    exits = set()
-    for connection in lanes[-1].getOutgoing():
-        turns_back = connection.getDirection() in ("t", "T")
-        if _allows_cars(connection) and _allows_cars(connection.getToLane()) and not turns_back:
-            exits.add(connection.getTo().getID())
     return AccelerationLane(
         begin_m=end_m - _length_m(main),
         end_m=end_m,
         lanes=tuple(piece.lane for piece in ramp if not piece.is_internal),
-        mainline_lanes=tuple(piece.lane for piece in main if not piece.is_internal),
         is_marked=any(lane.isAccelerationLane() for lane in lanes),
-        exits=tuple(sorted(exits - {link.target.getEdge().getID()})),
     )
 
 

@@ -208,17 +208,13 @@ class AccelerationLane:
         begin_m: lane coordinate of its begin, the gore.
         end_m: lane coordinate of its end.
         lanes: ids of its lanes in the net file, one for each edge.
-        mainline_lanes: ids of the lanes next to it.
         is_marked: whether the net has the mark of netconvert for acceleration lanes.
-        exits: ids of the edges after it except that of the mainline: weaving traffic leaves there.
     """
 
     begin_m: float
     end_m: float
     lanes: tuple[str, ...]
-    mainline_lanes: tuple[str, ...]
     is_marked: bool
-    exits: tuple[str, ...]
 
     @property
     def length_m(self) -> float:

@@ -138,7 +138,6 @@ def test_an_acceleration_lane_over_two_edges_with_an_exit(tmp_path):
         find_road(read_net(net), ["in", "acc", "mid"], ["ramp", "acc", "mid"])
     road = find_road(read_net(net), ["in", "acc", "mid", "out"], ["ramp", "acc", "mid", "out"])
     assert road.acceleration_lane.lanes == ("acc_0", "mid_0")
-    assert road.acceleration_lane.exits == ("exit",)
 
 
 def edited(old: str, new: str):
