@@ -24,7 +24,6 @@ MARGIN_M = 20.0
 LANE_COLOUR = "#009e73"
 POINT_COLOUR = "#d55e00"
 ROAD_COLOUR = "#c9c7c1"
-OTHERS_COLOUR = "#dfdcd5"
 PAPER = "#f7f6f3"
 
 Line = list[tuple[float, float]]
@@ -56,8 +55,6 @@ def road_svg(road: Road, scenario: Scenario) -> bytes:
         width=f"{WIDTH_PX}",
         style=f"background: {PAPER}",
     )
-    for shape in road.surroundings:
-        _draw(root, [(x, y) for x, y, _ in shape], OTHERS_COLOUR)
     for line in lines:
         _draw(root, line, ROAD_COLOUR)
     _draw(root, _part(road.mainline, *scenario.x_pov0_m), COLOURS["pov"], LANE_M / 2.0)
@@ -106,8 +103,7 @@ def road_data(road: Road) -> dict[str, Any]:
         road: the road, anywhere in its net.
 
     Returns:
-        The paths "main" and "ramp" as points (lane coordinate, x, y), and "lanes", the points
-        (x, y) of all lanes near M; in m.
+        The paths "main" and "ramp" as points (lane coordinate, x, y), in m.
     """
     at = road.lane_point(0.0, on_ramp=False)
     ahead_x, ahead_y = math.sin(math.radians(at.angle_deg)), math.cos(math.radians(at.angle_deg))
@@ -117,11 +113,7 @@ def road_data(road: Road) -> dict[str, Any]:
         along, left = dx * ahead_x + dy * ahead_y, dy * ahead_x - dx * ahead_y
         return [round(along, 2), round(left, 2)]
 
-    data: dict[str, Any] = {"lanes": []}
-    shapes = list(road.surroundings)
+    data: dict[str, Any] = {}
     for name, path in (("main", road.mainline), ("ramp", road.ramp)):
         data[name] = [[round(x_m, 2), *turned(x, y)] for x_m, x, y in path.corners()]
-        shapes += [piece.shape for piece in path.pieces]
-    for shape in dict.fromkeys(shapes):
-        data["lanes"].append([turned(x, y) for x, y, _ in shape])
     return data

@@ -40,8 +40,6 @@ SumoConnection = Any
 
 FARTHEST_M = 2e7
 """Largest coordinate and length in a net: half way round the earth, in metres of UTM."""
-SURROUNDINGS_M = 500.0
-"""Distance to M up to which lanes next to the paths are drawn."""
 VISIBILITY = "visibility"
 """Attribute of a connection: distance from which its driver sees the others, in m."""
 POINT_M = 1e-6
@@ -253,25 +251,9 @@ def _road(
         ramp_approach=_approach(junction, meeting, RAMP),
         lane_drop=meeting.ending is not None,
         drawn_after_m=end_m + _length_m(onward),
-        surroundings=_surroundings(net, shared[0].shape[0], placed),
         lane_m=lane_m and (begin_m, end_m),
         acceleration_lane=lane,
     )
-
-
-def _surroundings(
-    net: SumoNet, at_m: Point, paths: Sequence[LanePath]
-) -> tuple[tuple[Point, ...], ...]:
-    """Return the shapes of lanes for cars that are near M and not in the paths."""
-    used = {piece.lane for path in paths for piece in path.pieces}
-    shapes = []
-    for edge in net.getEdges():
-        for lane in _lanes(net, edge.getID()):
-            points = lane.getShape3D()
-            is_near = any(math.dist(point, at_m) <= SURROUNDINGS_M for point in points)
-            if is_near and lane.getID() not in used:
-                shapes.append(_shape(lane))
-    return tuple(shapes)
 
 
 def _approach(junction: Any, meeting: _Meeting, path: int) -> Approach:

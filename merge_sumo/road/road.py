@@ -262,7 +262,6 @@ class Road:
         ramp_approach: right of way of the ramp at M.
         lane_drop: whether one path comes to M from a lane that ends.
         drawn_after_m: length after M in the file; from there the last lane continues straight on.
-        surroundings: shapes of the other lanes near M, for drawings.
         lane_m: begin and end of the acceleration lane of a scenario, as lane coordinates; None
             where both paths meet in one point, M.
         acceleration_lane: that of the road, also where a scenario does not use it.
@@ -279,7 +278,6 @@ class Road:
     ramp_approach: Approach
     lane_drop: bool
     drawn_after_m: float
-    surroundings: tuple[tuple[Point, ...], ...]
     lane_m: Bounds | None = None
     acceleration_lane: AccelerationLane | None = None
 

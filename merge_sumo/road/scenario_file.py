@@ -11,7 +11,6 @@ x_pov0_m = [-220, -90]
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -42,7 +41,7 @@ def named_scenario(name: str) -> Scenario:
         The scenario.
 
     Raises:
-        UserError: no scenario has this name, or the file has an error, which is named by its line.
+        UserError: no scenario has this name, or a value of the file is missing or wrong.
 
     Example:
         >>> named_scenario("us23-lane").lane_m
@@ -66,20 +65,11 @@ def named_scenario(name: str) -> Scenario:
 
 def _read(path: Path) -> Scenario:
     """Return the scenario of a file, with its net as the file names it."""
-    text, record = read_toml(path, "scenario")
+    _, record = read_toml(path, "scenario")
     try:
         return convert({"name": path.stem, **record}, Scenario)
     except UserError as error:
-        raise UserError(f"{path}{_line(text, str(error))}: {error}") from error
-
-
-def _line(text: str, sentence: str) -> str:
-    """Return ", line N" of the first key in a file that a sentence begins with or quotes."""
-    for number, line in enumerate(text.splitlines(), start=1):
-        key = re.match(r"\s*([\w-]+)\s*=", line)
-        if key and re.search(rf"(^|'){re.escape(key[1])}('| is )", sentence):
-            return f", line {number}"
-    return ""
+        raise UserError(f"{path}: {error}") from error
 
 
 COMMENTS = {

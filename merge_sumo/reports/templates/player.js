@@ -123,7 +123,7 @@ function TopView(svg) {
   this.show = () => {
     svg.replaceChildren();
     // A lane is 3.2 m wide: what is left free between two lanes is the line between them.
-    for (const lane of data.lanes) draw(svg, "path", { class: "lane", d: path(lane.map(([x, y]) => [x, -y])), "stroke-width": 3.05 });
+    for (const lane of [data.main, data.ramp]) draw(svg, "path", { class: "lane", d: path(lane.map(([, x, y]) => [x, -y])), "stroke-width": 3.05 });
     LANE ? drawLane() : draw(svg, "line", { class: "merge", x1: 0, x2: 0, y1: -5.4, y2: 2.4, "stroke-width": 0.25 });
     for (const who of vehicles) {
       const group = draw(svg, "g");
