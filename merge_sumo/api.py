@@ -584,7 +584,7 @@ def run_and_report(
         if config.check is not None:
             config.check()
 
-    def on_part(title: str, unit: str, done: int, total: int) -> None:
+    def _on_part(title: str, unit: str, done: int, total: int) -> None:
         bars.counted(title, done, total, unit)
         on_cases(())
 
@@ -599,9 +599,9 @@ def run_and_report(
             result = CampaignRun(done, config.gates)
             study = run_study.RunStudy(done, settings, replace(plan, against=None), available)
             counterfactuals.write_avoidance(
-                study, partial(on_part, "reference drivers", "failures")
+                study, partial(_on_part, "reference drivers", "failures")
             )
-            share.write_shares(study, partial(on_part, "uniform starts", "cases"))
+            share.write_shares(study, partial(_on_part, "uniform starts", "cases"))
             explanation.write_worst_explanation(study)
             link_latest(folder)
             write_report(done)

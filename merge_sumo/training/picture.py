@@ -106,14 +106,24 @@ class _Canvas:
         self._centre_m = (pov_front_m + vut_front_m) / 2.0
 
     def draw_line(self, colour: str, points_m: FloatArray, width_m: float) -> None:
-        """Draw a line through points, (n, 2)."""
+        """Draw a line.
+
+        Args:
+            colour: its colour.
+            points_m: the points that it joins, (n, 2).
+            width_m: its width.
+        """
         width_px = math.ceil(width_m * self._px_per_m)
         self._pygame.draw.lines(self.surface, colour, False, self._pixels(points_m), width_px)
 
     def draw_car(self, name: str, ends_m: FloatArray, v_mps: float, down_px: float) -> None:
-        """Draw a car from its rear to its front, (2, 2), and its speed as a label.
+        """Draw a car, and its speed as a label.
 
-        The label is `down_px` below the car; above it where the number is negative.
+        Args:
+            name: name of the vehicle, a key of `COLOURS`.
+            ends_m: its rear and its front, (2, 2).
+            v_mps: its speed.
+            down_px: distance of the label below the car; negative for a label above it.
         """
         self.draw_line(COLOURS[name], ends_m, CAR_M)
         font = self._pygame.font.Font(None, FONT_PX)
