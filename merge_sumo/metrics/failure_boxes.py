@@ -67,8 +67,8 @@ def failure_boxes(outcomes: Sequence[Outcome], level: int) -> list[FailureBox]:
     """Return the boxes in which the failures of a level lie, the one with most failures first.
 
     A small decision tree (scikit-learn, Gini, balanced classes) separates failing from other
-    cases. Its leaves in which at least half of the cases fail are the boxes; failing siblings are
-    one box. The shares are of cases that a sampler chose: they are not probabilities.
+    cases. Its leaves in which at least half of the cases fail are the boxes. The shares are of
+    cases that a sampler chose: they are not probabilities.
 
     Args:
         outcomes: outcomes of a campaign, one a case.
@@ -93,10 +93,9 @@ def failure_boxes(outcomes: Sequence[Outcome], level: int) -> list[FailureBox]:
         class_weight="balanced",
         random_state=0,
     ).fit(places, failed)
-    fails = _failing_nodes(tree.tree_, tree.apply(places), failed)
     boxes = []
     unbounded = np.full(places.shape[1], np.inf)
-    for lows, highs in _bounds(tree.tree_, fails, 0, -unbounded, unbounded):
+    for lows, highs in _bounds(tree.tree_, 0, -unbounded, unbounded):
         words = []
         inside = np.ones(len(judged), dtype=bool)
         for (name, unit), values, low, high in zip(quantities, places.T, lows, highs, strict=True):
@@ -110,41 +109,20 @@ def failure_boxes(outcomes: Sequence[Outcome], level: int) -> list[FailureBox]:
             elif np.isfinite(high):
                 words.append(f"{name} below {most} {unit}")
         failures = int(failed[inside].sum())
-        if failures >= FEWEST_FAILURES:
+        if failures >= max(FEWEST_FAILURES, inside.sum() / 2):
             indices = tuple(judged[place].index for place in np.flatnonzero(inside))
             where = " and ".join(words) or "anywhere"
             boxes.append(FailureBox(level, where, indices, failures))
     return sorted(boxes, key=lambda box: -box.failures)
 
 
-def _failing_nodes(tree: Any, leaf: FloatArray, failed: FloatArray) -> list[bool]:
-    """Return whether at least half of the cases fail in each leaf below a node, by node.
-
-    Args:
-        tree: nodes as scikit-learn has them; children come after their parent.
-        leaf: leaf of each case, (n,).
-        failed: whether each case failed, (n,).
-    """
-    fails = [False] * tree.node_count
-    for node in reversed(range(tree.node_count)):
-        left, right = tree.children_left[node], tree.children_right[node]
-        if left < 0:
-            fails[node] = failed[leaf == node].mean() >= 0.5
-        else:
-            fails[node] = fails[left] and fails[right]
-    return fails
-
-
 def _bounds(
-    tree: Any, fails: list[bool], node: int, low: FloatArray, high: FloatArray
+    tree: Any, node: int, low: FloatArray, high: FloatArray
 ) -> list[tuple[FloatArray, FloatArray]]:
-    """Return the lower and upper bounds, (d,), of the largest failing nodes from a node on."""
-    if fails[node]:
-        return [(low, high)]
+    """Return the lower and upper bounds, (d,), of the leaves below a node."""
     left, right = tree.children_left[node], tree.children_right[node]
     if left < 0:
-        return []
+        return [(low, high)]
     below, above = high.copy(), low.copy()
     below[tree.feature[node]] = above[tree.feature[node]] = tree.threshold[node]
-    found = _bounds(tree, fails, left, low, below)
-    return found + _bounds(tree, fails, right, above, high)
+    return _bounds(tree, left, low, below) + _bounds(tree, right, above, high)
