@@ -129,7 +129,7 @@ def cost_of_cases(*_: object) -> dict[str, dict[int, float]]:
         gap_m = result.outcome.measures.dx_m
         gap_m = np.nan if gap_m is None else gap_m
         chance = 0.9 if abs(gap_m) < US23.dx_crash_m else 0.1
-        told = Prediction.of(gap_m + rng.normal(0.0, 0.5, (2, 4)), chance, chance, chance)
+        told = Prediction.of(gap_m + rng.normal(0.0, 0.5, 4), chance, chance, chance)
         outcomes.append(result.at(index, index // COMPARED_BATCH, told).outcome)
         motions[index] = result.trajectory.motion
     figures: dict[str, dict[int, float]] = {"ms of CPU per case": {}, "MB of the model": {}}

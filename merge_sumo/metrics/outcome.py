@@ -10,7 +10,6 @@ from typing import Annotated, Any, Self, get_type_hints
 import numpy as np
 from msgspec import Meta
 
-from merge_sumo.errors import UserError
 from merge_sumo.files import Files
 from merge_sumo.metrics.measures import FOLLOW_UP, OURS, Measures, measures_in
 from merge_sumo.metrics.paper import margin_of
@@ -32,14 +31,14 @@ class Prediction(Record, frozen=True):
     """The prediction of a case before it ran: gaps at M and the failure probability.
 
     Attributes:
-        dx_m: signed gaps at M, (1, M), in m: one for each of the M members of the model of the
+        dx_m: signed gaps at M, in m, in one row: one for each member of the model of the
             controller (`twin` in files); None where the VUT never arrived.
         p_twin: failure probability by these gaps.
         p_surrogate: failure probability by the surrogate of the outcomes.
         p_fail: failure probability by both.
     """
 
-    dx_m: tuple[tuple[float | None, ...], ...]
+    dx_m: tuple[tuple[float | None, ...]]
     p_twin: Probability
     p_surrogate: Probability
     p_fail: Probability
@@ -49,31 +48,15 @@ class Prediction(Record, frozen=True):
         """Return a rounded prediction.
 
         Args:
-            dx_m: signed gaps at M, (1, M), in m; NaN where the VUT never arrived.
+            dx_m: signed gaps at M, (M,), in m; NaN where the VUT never arrived.
             p_twin: failure probability by the gaps.
             p_surrogate: failure probability by the surrogate.
             p_fail: failure probability by both.
         """
-        gaps = []
-        for row in np.round(dx_m, _DIGITS).tolist():
-            gaps.append(tuple(None if math.isnan(gap) else gap for gap in row))
+        rounded_m = np.round(dx_m, _DIGITS).tolist()
+        gaps = tuple(None if math.isnan(gap) else gap for gap in rounded_m)
         probabilities = (round(float(p), _DIGITS) for p in (p_twin, p_surrogate, p_fail))
-        return cls(tuple(gaps), *probabilities)
-
-    @property
-    def gaps_m(self) -> FloatArray:
-        """The gaps, (1, M), in m; NaN where the VUT never arrived."""
-        return np.array(self.dx_m, dtype=np.float64)
-
-    def __post_init__(self) -> None:
-        """Check that every row has the same number of gaps.
-
-        Raises:
-            UserError: a row has none, or another number than the first.
-        """
-        counts = {len(row) for row in self.dx_m}
-        if len(counts) != 1 or 0 in counts:
-            raise UserError("dx_m must have the same number of gaps, 1 or more, for every member")
+        return cls((gaps,), *probabilities)
 
 
 @dataclass(frozen=True, slots=True)

@@ -156,7 +156,7 @@ class CoverageSampler(Sampler):
             if level not in points:
                 predictions += [None] * len(of_level)
                 continue
-            gaps_m = self.pool.scenario.dx_crash_m * gaps[level][None]
+            gaps_m = self.pool.scenario.dx_crash_m * gaps[level]
             chances = searches[level].chances(of_level, gaps[level]).T.tolist()
             for index, (by_model, by_surrogate, by_both) in enumerate(chances):
                 prediction = Prediction.of(gaps_m[..., index], by_model, by_surrogate, by_both)

@@ -146,7 +146,7 @@ class TestModel:
 
 class TestPrediction:
     def test_is_read_as_it_was_written(self):
-        one = Prediction.of(np.array([[1.23456, math.nan]]), 0.5, 0.25, 0.4)
+        one = Prediction.of(np.array([1.23456, math.nan]), 0.5, 0.25, 0.4)
         assert one.dx_m == ((1.2346, None),)
         assert decode(json.dumps(to_plain(one)), Prediction) == one
 

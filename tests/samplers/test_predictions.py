@@ -26,7 +26,7 @@ def outcome(*, failed, model=0.5, surrogate=0.5, p_fail=0.5, predicted=True):
     """Return the outcome of a case, by default of a prediction that favours nothing."""
     score, dx_m = (-600.0, 0.0) if failed else (-50.0, 60.0)
     measures = Measures(end=End.MERGED, score=score, t_end_s=8.3, dx_m=dx_m)
-    prediction = Prediction.of(np.zeros((1, 8)), model, surrogate, p_fail) if predicted else None
+    prediction = Prediction.of(np.zeros(8), model, surrogate, p_fail) if predicted else None
     return Outcome(0, 0, CASE, measures, prediction)
 
 
