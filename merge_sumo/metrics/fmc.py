@@ -22,6 +22,8 @@ from functools import cache, lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 from scipy.special import ndtri
 
@@ -218,16 +220,11 @@ def regions(points: ArrayLike, radius: float | None = None) -> IntArray:
     """
     cases = _checked(points)
     limit = (radius or radius_for(cases.shape[1])) * (1.0 + SLACK)
-    tree = cKDTree(cases)
-    first = np.full(len(cases), -1)
-    for start in range(len(cases)):
-        to_visit = [start] if first[start] < 0 else []
-        while to_visit:
-            near = np.array(tree.query_ball_point(cases[to_visit.pop()], limit))
-            new = near[first[near] < 0]
-            first[new] = start
-            to_visit += new.tolist()
-    _, region, size = np.unique(first, return_inverse=True, return_counts=True)
+    pairs = cKDTree(cases).query_pairs(limit, output_type="ndarray")
+    links = coo_array((np.ones(len(pairs)), pairs.T), shape=(len(cases), len(cases)))
+    # Numbered in the order of their first point.
+    _, region = connected_components(links, directed=False)
+    size = np.bincount(region)
     rank = np.empty(len(size), dtype=np.int64)
     rank[np.argsort(-size, kind="stable")] = np.arange(len(size))
     ranked: IntArray = rank[region]
