@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 import re
-import sys
 from functools import lru_cache
 from typing import Any
 
@@ -37,8 +36,6 @@ SIGNALS = (
 """Signals of a formula, at every step; of the car that is nearest to the VUT at M."""
 NEVER_S = 100.0
 """Time to collision where no gap closes, and the longest one."""
-LAST_PYTHON = (3, 12)
-"""The last one that the parser of rtamt runs on."""
 WORDS = (
     "always",
     "eventually",
@@ -111,12 +108,10 @@ def try_formula(text: str) -> None:
     try:
         _robustness(text, {name: np.ones(2) for name in SIGNALS})
     except ImportError as error:
-        how = "pip install 'merge-sumo[stl]'"
-        if sys.version_info[:2] > LAST_PYTHON:
-            how = "it runs up to Python {}.{}; use that, or a condition with `fail_when`".format(
-                *LAST_PYTHON
-            )
-        raise UserError(f"`require` needs rtamt: {how}") from error
+        raise UserError(
+            "`require` needs rtamt, which runs up to Python 3.12: pip install 'merge-sumo[stl]', "
+            "or write a condition with `fail_when`"
+        ) from error
     except UserError:
         raise
     # The parser of rtamt raises errors of many types.
