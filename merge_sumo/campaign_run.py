@@ -193,7 +193,7 @@ class CampaignRun(Result):
 
     @property
     def _doubts(self) -> list[str]:
-        return doubts(self.recorded.cases, self.recorded.criterion, self.recorded.settings.in_vain)
+        return doubts(self.recorded.cases, self.recorded.settings.in_vain)
 
     def to_record(self) -> dict[str, Any]:
         """Return the object that `merge-sumo campaign --json` prints.

@@ -188,7 +188,7 @@ def _notes(plan: SimulationPlan, driven: Sequence[Trajectory]) -> list[str]:
         outcomes.append(plan.criterion.outcome(trajectory, index=index))
         in_vain.update(trajectory.in_vain)
     clipped = mostly_clipped(outcomes)
-    notes = doubts(outcomes, plan.criterion, in_vain)
+    notes = doubts(outcomes, in_vain)
     return notes if clipped is None else [clipped, *notes]
 
 

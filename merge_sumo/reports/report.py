@@ -83,7 +83,7 @@ def report_page(model: ReportModel, *, running: bool = False) -> str:
     for warning in (unrepeatable(read_second_runs(run)), mostly_clipped(run.cases)):
         if warning is not None:
             warnings.append(warning)
-    notes = doubts(run.cases, run.criterion, run.settings.in_vain)
+    notes = doubts(run.cases, run.settings.in_vain)
     if run.settings.ran_again:
         notes.append(run.ran_again_in_words)
     # No "<" in the JSON: nothing in it can end its element.
