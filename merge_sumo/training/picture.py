@@ -76,8 +76,9 @@ class GamePicture:
         _, pov_front_m = pov_ends_m
         _, vut_front_m = vut_ends_m
         canvas = _Canvas(self._pygame, pov_front_m, vut_front_m)
-        for lane in self._road["lanes"]:
-            canvas.draw_line(ROAD, np.array(lane), LANE_M)
+        for path in ("main", "ramp"):
+            points_m = np.array(self._road[path])[:, 1:]  # without the lane coordinate
+            canvas.draw_line(ROAD, points_m, LANE_M)
         canvas.draw_line(INK, MERGE_LINE_M, MERGE_LINE_WIDTH_M)
         canvas.draw_car("pov", pov_ends_m, v_pov_mps, -LABEL_PX)
         canvas.draw_car("vut", vut_ends_m, v_vut_mps, LABEL_PX)
