@@ -26,16 +26,15 @@ from merge_sumo.controllers.kinds import load
 from merge_sumo.controllers.process import LOG
 from merge_sumo.drivers.base import MERGE, STAY, Driver, DriverWrapper, Scene
 from merge_sumo.drivers.car_following import follow_mps2
-from merge_sumo.drivers.levelk import DECISION_STEPS
 from merge_sumo.drivers.reference_drivers import REFERENCE_DRIVERS, CarefulPov
 from merge_sumo.metrics.merge import brake_after_mps2
 from merge_sumo.records import Record
 from merge_sumo.road.loader import centre_lines
 from merge_sumo.scenario.case import Case, FloatArray
 from merge_sumo.scenario.scenario import DT_S, EpisodeTime
-from merge_sumo.scenario.trajectory import End, Trajectory
+from merge_sumo.scenario.trajectory import Trajectory
 from merge_sumo.simulation.evaluate import opened_simulator
-from merge_sumo.simulation.plan import Engine, SimulationPlan
+from merge_sumo.simulation.plan import SimulationPlan
 from merge_sumo.simulation.rollout import RING_ROWS, Rollout
 from merge_sumo.simulation.simulator import Simulator
 
@@ -110,14 +109,12 @@ class Counterfactual(Case):
     Attributes:
         failure: the recorded motion.
         by: name of the reference driver in the place of the VUT.
-        first: step of the recorded motion at which the episode begins.
-        until: step up to which the VUT moves as recorded.
+        until: step up to which the VUT moves by its recorded accelerations.
         careful_pov: whether a careful driver is in the place of the POV.
     """
 
     failure: Trajectory = field(compare=False, repr=False)
     by: str = TAKES_OVER
-    first: int = 0
     until: int = 0
     careful_pov: bool = False
 
@@ -132,22 +129,6 @@ class Counterfactual(Case):
         for one in fields(failure.case):
             other[one.name] = getattr(failure.case, one.name)
         return cls(failure=failure, **other)
-
-    def starts(self) -> list[tuple[float, float]]:
-        """Return position and speed of every vehicle where the episode begins, in m and m/s."""
-        return [(x, v) for x, v, _ in self.failure.motion[self.first].tolist()]
-
-    def from_the_start(self, trajectory: Trajectory) -> Trajectory:
-        """Return the trajectory of the episode with the steps before it.
-
-        Args:
-            trajectory: the trajectory from step `first` on.
-        """
-        if not self.first:
-            return trajectory
-        motion = np.concatenate((self.failure.motion[: self.first], trajectory.motion))
-        late = len(motion) - 1 > self.scenario.max_steps
-        return replace(trajectory, motion=motion, end=End.TIMEOUT if late else trajectory.end)
 
 
 def avoidances(plan: SimulationPlan, failing: Sequence[tuple[int, Trajectory]]) -> list[Avoidance]:
@@ -190,10 +171,8 @@ def _latest_takeovers_s(
         for row, motion in enumerate(motions):
             end = _steps(motion) - tried if latest_s[row] is None else 0
             for until in range(max(end - BLOCK_STEPS, 0), end):
-                # Learned POVs have no other memory than their last decision; a user's POV may.
-                first = 0 if plan.engine is Engine.SUMO else until - until % DECISION_STEPS
                 rows.append(row)
-                cases.append(Counterfactual.of(motion, first=first, until=until))
+                cases.append(Counterfactual.of(motion, until=until))
         for row, case, avoided in zip(rows, cases, _avoided(plan, simulator, cases), strict=True):
             if avoided:
                 latest_s[row] = round(case.until * DT_S, 1)  # in rising order
@@ -214,9 +193,8 @@ def _avoided(
     lines = centre_lines(plan.road)
     avoided = []
     for case, trajectory in zip(cases, trajectories, strict=True):
-        whole = case.from_the_start(trajectory)
-        can_brake = brake_after_mps2(whole) <= -case.scenario.a_min_mps2
-        avoided.append(can_brake and plan.criterion.outcome(whole, lines).passes)
+        can_brake = brake_after_mps2(trajectory) <= -case.scenario.a_min_mps2
+        avoided.append(can_brake and plan.criterion.outcome(trajectory, lines).passes)
     return avoided
 
 
@@ -240,10 +218,10 @@ class _Substitutes(Driver):
         super().begin(corridor, case)
         assert isinstance(case, Counterfactual), "only counterfactuals run here"  # noqa: S101
         self._by[corridor] = list(self._drivers).index(case.by)
-        self._until[corridor] = case.until - case.first
-        recorded = case.failure.a_vut_mps2[case.first : case.scenario.max_steps + 1]
+        self._until[corridor] = case.until
+        recorded = case.failure.a_vut_mps2[: case.scenario.max_steps + 1]
         self._recorded[: len(recorded), corridor] = recorded
-        self._merges_at[corridor] = _steps(case.failure) - 1 - case.first
+        self._merges_at[corridor] = _steps(case.failure) - 1
         self._drivers[case.by].begin(corridor, case)
 
     def act(self, scene: Scene) -> FloatArray:
