@@ -60,32 +60,17 @@ class SamplerRun:
     outcomes: list[Outcome]
     fmc: list[float]
 
-    def failures(self, level: int, batch: int | None = None) -> FloatArray:
+    def failures(self, level: int) -> FloatArray:
         """Return the failing cases of a level as points of the unit cube, (m, d).
 
         Args:
             level: level of the POV.
-            batch: their batch; None for all.
         """
         cases = []
         for one in self.outcomes:
-            if one.failed and one.case.level == level and batch in (None, one.batch):
+            if one.failed and one.case.level == level:
                 cases.append(one.case)
         return to_unit(cases, level)
-
-    def covered_shares(self, level: int, points: FloatArray) -> FloatArray:
-        """Return the share of points that the failures cover after each batch, (batches,).
-
-        Args:
-            level: level of the POV.
-            points: points of the unit cube, (m, d).
-        """
-        is_covered = np.zeros(len(points), dtype=bool)
-        shares = []
-        for batch in range(len(self.fmc)):
-            is_covered |= covered(points, self.failures(level, batch))
-            shares.append(is_covered.mean())
-        return np.array(shares)
 
 
 def search(
@@ -309,7 +294,6 @@ class SamplerSummary:
         cases_to_90_percent: cases until .9 of the truth's FMC.
         cases_by_batch: cases after each batch.
         fmc_by_batch: quartiles of FMC after each batch, at 25, 50 and 75 %.
-        covered_share_by_batch: median of the covered share after each batch; None without failures.
     """
 
     fmc: Spread
@@ -321,7 +305,6 @@ class SamplerSummary:
     cases_to_90_percent: Spread
     cases_by_batch: list[int]
     fmc_by_batch: list[list[float]]
-    covered_share_by_batch: list[float] | None
 
 
 @dataclass(frozen=True, repr=False)
@@ -351,16 +334,16 @@ class SamplerStudy(Result):
 
     @property
     def is_small(self) -> bool:
-        """Whether a truth is too small to be divided by."""
+        """Whether a truth is too small for shares and regions."""
         return any(truth.is_small for truth in self.truths.values())
 
     @cached_property
     def regions(self) -> list[tuple[int, FloatArray]] | None:
         """Level and points, (m, d), of each region of the truths; None where one is too small."""
+        if self.is_small:
+            return None
         found = []
         for level, truth in self.truths.items():
-            if not truth.tells_regions:
-                return None
             found += [(level, region) for region in truth.real_regions()]
         return found
 
@@ -402,7 +385,7 @@ class SamplerStudy(Result):
         truth_fmc = math.nan if self.is_small else self.truth_fmc or math.nan
         by_batch = Counter(outcome.batch for outcome in searches[0].outcomes)
         after = list(accumulate(by_batch.values()))
-        shares = np.full(curves.shape, np.nan)
+        covered_share: list[float] = []
         failures: list[float] = []
         regions_found: list[float] = []
         cases_to_90_percent: list[float] = []
@@ -410,9 +393,10 @@ class SamplerStudy(Result):
             failures.append(sum(outcome.failed for outcome in search.outcomes))
             reached = np.flatnonzero(curves[row] >= 0.9 * truth_fmc)
             cases_to_90_percent.append(after[reached[0]] if len(reached) else math.inf)
-            of_levels = [search.covered_shares(level, at) for level, at in self.probes.items()]
-            if of_levels:
-                shares[row] = np.mean(of_levels, axis=0)
+            of_levels = []
+            for level, points in self.probes.items():
+                of_levels.append(covered(points, search.failures(level)).mean())
+            covered_share.append(np.mean(of_levels) if of_levels else math.nan)
             found = math.nan if self.regions is None else 0.0
             for level, region in self.regions or ():
                 found += bool(covered(search.failures(level), region).any())
@@ -421,13 +405,12 @@ class SamplerStudy(Result):
             fmc=Spread.of(curves[:, -1]),
             fmc_over_truth=Spread.of(curves[:, -1] / truth_fmc),
             fmc_over_limit=Spread.of(curves[:, -1] / (self.limit_fmc or math.nan)),
-            covered_share=Spread.of(shares[:, -1]),
+            covered_share=Spread.of(covered_share),
             failures=Spread.of(failures),
             regions_found=Spread.of(regions_found),
             cases_to_90_percent=Spread.of(cases_to_90_percent),
             cases_by_batch=after,
             fmc_by_batch=np.quantile(curves, (0.25, 0.5, 0.75), axis=0).tolist(),
-            covered_share_by_batch=np.median(shares, axis=0).tolist() if self.probes else None,
         )
 
     def to_record(self) -> dict[str, Any]:

@@ -26,7 +26,7 @@ from merge_sumo.files import (
     sha256_of,
 )
 from merge_sumo.metrics.criterion import Criterion
-from merge_sumo.metrics.fmc import fmc, growth_bound, has_neighbour, regions
+from merge_sumo.metrics.fmc import fmc, growth_bound, regions
 from merge_sumo.metrics.outcome import Episode
 from merge_sumo.records import decode, read_arrays
 from merge_sumo.result import Result
@@ -45,13 +45,10 @@ MOST_FILES_BYTES = 1 << 26
 REAL_REGION = 0.03
 """A region of the truth counts when it holds at least this share of its failures."""
 MOST_GROWTH = 0.2
-"""A truth is too small to be divided by where the same number of further cases could add more than
-this share to its FMC. Measured with designs 1 and 2 in two and three coordinates: truths of 2,500
-to 160,000 cases that could add less had .77 to .97 of the coverage of 1,000,000 cases, the others
-.03 to .83."""
-MOST_ALONE = 0.05
-"""Maximum share of failures without another one in the radius: with more of them a region falls
-apart into single failures. Chosen, not tuned."""
+"""A truth is too small for shares and regions where the same number of further cases could add more
+than this share to its FMC. Measured with designs 1 and 2 in two and three coordinates: truths of
+2,500 to 160,000 cases that could add less had .77 to .97 of the coverage of 1,000,000 cases, the
+others .03 to .83."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,19 +81,8 @@ class Truth:
 
     @property
     def is_small(self) -> bool:
-        """Whether n further cases could add so much to its FMC that no share of it is shown."""
+        """Whether n further cases could add so much to its FMC that it has no shares or regions."""
         return self.growth > MOST_GROWTH
-
-    @property
-    def alone(self) -> float:
-        """Share of the failures that have no other one within the radius of FMC."""
-        linked = has_neighbour(self.failures)
-        return 1.0 - float(linked.mean()) if len(linked) else 0.0
-
-    @property
-    def tells_regions(self) -> bool:
-        """Whether failures are dense enough to be linked into regions."""
-        return self.alone <= MOST_ALONE
 
     def to_record(self) -> dict[str, Any]:
         """Return the truth as JSON has it."""
@@ -106,7 +92,7 @@ class Truth:
             "failures": len(failures),
             "fmc": fmc(failures),
             "region_sizes": np.bincount(regions(failures)).tolist(),
-            "real_regions": len(self.real_regions()) if self.tells_regions else None,
+            "real_regions": None if self.is_small else len(self.real_regions()),
             "fmc_growth": self.growth,
             "too_small": self.is_small,
             "in_sumo": self.in_sumo,

@@ -153,29 +153,12 @@ def covered(points: ArrayLike, failures: ArrayLike) -> BoolArray:
     Returns:
         Shape (m,).
     """
-    return _near(points, failures, nth=1)
-
-
-def has_neighbour(points: ArrayLike) -> BoolArray:
-    """Return which of some points have another one within the radius.
-
-    Args:
-        points: places, (n, d), as those of `fmc`.
-
-    Returns:
-        Shape (n,).
-    """
-    return _near(points, points, nth=2)
-
-
-def _near(points: ArrayLike, others: ArrayLike, nth: int) -> BoolArray:
-    """Return for which points, (m, d), the nth nearest of others is within the radius, (m,)."""
-    places, found = _checked(points), _checked(others)
-    if len(places) == 0 or len(found) == 0:
+    places, centres = _checked(points), _checked(failures)
+    if len(places) == 0 or len(centres) == 0:
         return np.zeros(len(places), dtype=np.bool_)
     limit = radius_for(places.shape[1]) * (1.0 + SLACK)
-    distance, _ = cKDTree(found).query(places, k=[nth], distance_upper_bound=2.0 * limit)
-    within: BoolArray = distance[:, 0] <= limit
+    distance, _ = cKDTree(centres).query(places, distance_upper_bound=2.0 * limit)
+    within: BoolArray = distance <= limit
     return within
 
 

@@ -31,7 +31,7 @@ from merge_sumo.campaigns.recorded import RecordedCampaign
 from merge_sumo.drivers.reference_drivers import REFERENCE_DRIVERS
 from merge_sumo.metrics.cause import cause, conflicting_car
 from merge_sumo.metrics.criterion import Criterion
-from merge_sumo.metrics.fmc import fmc, radius_for
+from merge_sumo.metrics.fmc import fmc
 from merge_sumo.metrics.measures import measures_in
 from merge_sumo.metrics.merge import Conflict
 from merge_sumo.metrics.outcome import Outcome
@@ -291,25 +291,12 @@ def transitions(version_change: VersionChange) -> list[str]:
 # Truths and samplers
 
 
-def truth_remarks(truth: Truth) -> list[str]:
-    """Return the quantities for which a truth has too few cases, in clauses.
-
-    Args:
-        truth: the truth of a level.
-    """
-    remarks = []
-    if truth.is_small:
-        remarks.append(
-            "too small to be divided by: "
-            f"the same number of cases again could add up to {truth.growth:.0%} to its FMC"
-        )
-    if not truth.tells_regions:
-        radius = radius_for(truth.points.shape[1])
-        remarks.append(
-            f"too small for regions: {truth.alone:.0%} of the failures have no other one within "
-            f"{radius:.2f}"
-        )
-    return remarks
+def _too_small(truth: Truth) -> str:
+    """Return that a truth has too few cases, in a clause."""
+    return (
+        "too small for shares and regions: the same number of cases again could add up to "
+        f"{truth.growth:.0%} to its FMC"
+    )
 
 
 @lines_of.register
@@ -326,15 +313,15 @@ def truth_lines(found: TruthResult) -> list[str]:
             f"{counted(len(truth.failures), 'failure')} in "
             f"{counted(len(truth.margin), 'case')}, FMC {fmc(truth.failures):.4f}"
         )
-        if truth.tells_regions:
+        if not truth.is_small:
             regions = counted(len(truth.real_regions()), "region")
             line += f", {regions} with at least {REAL_REGION:.0%} of the failures"
         if truth.in_sumo < len(truth.margin):
             cases = counted(truth.in_sumo, "case")
             line += f"; by the equations of motion, and {cases} in SUMO as well, all alike"
         lines.append(line)
-        for remark in truth_remarks(truth):
-            lines.append(f"  {remark}")
+        if truth.is_small:
+            lines.append(f"  {_too_small(truth)}")
     return [*lines, f"  a case fails when {found.criterion.description(found.scenario)}"]
 
 
@@ -361,8 +348,8 @@ def sampler_lines(study: SamplerStudy) -> list[str]:
         line += f", {counted(len(study.regions), 'region')}"
     lines = [line]
     for level, truth in study.truths.items():
-        for remark in truth_remarks(truth):
-            lines.append(f"  at level {level_name(level)} it is {remark}")
+        if truth.is_small:
+            lines.append(f"  at level {level_name(level)} it is {_too_small(truth)}")
     line = f"limit: FMC {study.limit_fmc:.4f}, of all failures of truth and searches"
     if study.dense:
         line += f", or of {DENSE_CASES:,} uniform cases, where that is more"
@@ -402,8 +389,9 @@ def reproduction_lines(found: Reproduction) -> list[str]:
     for name, cells in table_ii(found):
         rows.append(f"| {name} | {' | '.join(cells)} |")
     for title, one in found.columns.items():
-        for remark in truth_remarks(one.study.truths[one.column.level]):
-            rows += ["", f"The truth of {title} is {remark}."]
+        truth = one.study.truths[one.column.level]
+        if truth.is_small:
+            rows += ["", f"The truth of {title} is {_too_small(truth)}."]
     return rows if found.page is None else [*rows, f"all of it: {found.page}"]
 
 

@@ -144,7 +144,7 @@ class TestASamplerByHand:
         assert (low[0], median[0], high[0]) == pytest.approx((disc / 4, disc / 2, disc * 3 / 4))
 
     def test_covers_a_share_of_the_failures_of_the_truth(self):
-        assert summary(HALF, truth=SMALL).covered_share_by_batch == [0.0, 0.5]
-        assert summary(MOST, truth=SMALL).covered_share_by_batch == [0.5, 1.0]
+        assert summary(HALF, truth=SMALL).covered_share.median == 0.5
+        assert summary(MOST, truth=SMALL).covered_share.median == 1.0
         dense = {0: truth_with((0.2, 0.2), (0.8, 0.8), (0.5, 0.5), (0.9, 0.1))}
         assert summary(HALF, truth=SMALL, dense=dense).covered_share.median == 0.25

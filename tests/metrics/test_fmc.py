@@ -21,7 +21,6 @@ from merge_sumo.metrics.fmc import (
     fmc,
     fmc_growth,
     growth_bound,
-    has_neighbour,
     radius_for,
     regions,
 )
@@ -148,11 +147,6 @@ def test_the_balls_around_failures_cover_places_within_the_radius_inclusively():
     assert covered(points, [[0.5, 0.5], [0.1, 0.1]]).tolist() == [True, False, False]
     assert covered(np.zeros((0, 2)), [[0.5, 0.5]]).tolist() == []
     assert covered([[0.5, 0.5]], np.zeros((0, 2))).tolist() == [False]
-
-
-def test_a_neighbour_is_another_point_within_the_radius():
-    points = [[0.1, 0.1], [0.1, 0.1 + RADIUS], [0.5, 0.5]]
-    assert has_neighbour(points).tolist() == [True, True, False]
 
 
 class TestTheBoundOfGrowth:

@@ -40,7 +40,7 @@ class TestATinyReproduction:
         assert all(f'src="{name}"' in page for name in FIGURES)
         assert "http" not in page
         assert "<script" not in page
-        assert "it is too small to be divided by" in page
+        assert "it is too small for shares and regions" in page
         record = json.loads((tmp_path / "table2.json").read_text())
         assert record == json.loads(json.dumps(tiny.to_record()))
         with pytest.raises(UserError, match="exists"):
@@ -57,7 +57,7 @@ class TestATinyReproduction:
                 assert sampler["fmc"]["median"] <= column["limit_fmc"]
         assert "| gpr / truth | - (0.78) | - (0.69) | - (0.44) |" in table
         assert "| coverage / limit |" in table
-        assert "The truth of level-0 POV, design1 is too small to be divided by" in table
+        assert "The truth of level-0 POV, design1 is too small for shares and regions" in table
 
 
 def test_the_papers_table_is_the_papers():
