@@ -91,7 +91,7 @@ from merge_sumo.simulation.plan import Engine, SimulationPlan
 from merge_sumo.simulation.povs import parse_levels, policies_folder
 from merge_sumo.sumo import replay as replayer
 from merge_sumo.sumo.binding import scratch_folder
-from merge_sumo.sumo.replay import Replay, check_display
+from merge_sumo.sumo.replay import Replay
 from merge_sumo.sumo.replay_folder import CONFIG, write_replay_folder
 from merge_sumo.workers import open_workers
 
@@ -213,8 +213,6 @@ def run(config: c.RunCase) -> CaseRun:
     plan = settings.load_plan(debug=config.debug)
     if before is not None:
         run_study.notice_changes(before, plan)
-    if config.gui:
-        check_display()
     with open_workers(1):  # which closes the simulator
         (episode,) = simulate(plan.for_cases(1), [case])
     result = CaseRun(episode, config.from_s)
@@ -311,7 +309,7 @@ def replay(folder: c.AnyRun, index: int | None = None, *, from_s: float | None =
     return replayer.replay(_scenario_folder(folder, index), from_s)
 
 
-def open_in_gui(folder: c.AnyRun, index: int | None = None, *, from_s: float | None = None) -> int:
+def open_in_gui(folder: c.AnyRun, index: int | None = None, *, from_s: float | None = None) -> None:
     """Show a case in sumo-gui until the window is closed.
 
     Args:
@@ -319,14 +317,11 @@ def open_in_gui(folder: c.AnyRun, index: int | None = None, *, from_s: float | N
         index: the case of the campaign, which is exported where it is not yet.
         from_s: begin so long before the first conflict, as in -3.
 
-    Returns:
-        1 where sumo-gui failed, else 0.
-
     Raises:
-        UserError: without a display.
+        UserError: sumo-gui failed, as without a display.
     """
     check_from(from_s)
-    return replayer.open_gui(_scenario_folder(folder, index), from_s)
+    replayer.open_gui(_scenario_folder(folder, index), from_s)
 
 
 def _scenario_folder(folder: c.AnyRun, index: int | None) -> Path:

@@ -319,7 +319,8 @@ def replay(
         The exit code.
     """
     if gui:
-        return ms.open_in_gui(**vars(config))
+        ms.open_in_gui(**vars(config))
+        return 0
     return print_result(ms.replay(**vars(config)), json)
 
 

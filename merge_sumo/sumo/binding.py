@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import importlib
 import os
-import re
 import subprocess
-import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -40,24 +38,16 @@ SUMO_OPTIONS = (
 """Options of every simulation, except on collisions."""
 NO_COLLISIONS = ("--collision.action", "none")
 """SUMO does not search for collisions, as measures show which vehicles touch."""
-NOT_A_NAME = re.compile(r"[,:%\ud800-\udfff]|\$\{")
-"""Not possible in a path for SUMO: it splits at commas and colons, and substitutes the others."""
 
 
 @contextmanager
 def scratch_folder() -> Iterator[Path]:
-    """Yield a temporary folder with a name that SUMO can use.
+    """Yield a temporary folder.
 
     Raises:
-        UserError: the folder for temporary files has another name, or cannot be written.
+        UserError: the folder for temporary files cannot be written.
     """
     try:
-        above = Path(tempfile.gettempdir())
-        if NOT_A_NAME.search(str(above)[len(above.drive) :]):
-            raise UserError(
-                f"SUMO cannot use the folder for temporary files {str(above)!r}: set TMPDIR to one "
-                "without commas, colons, percent signs, ${ and bytes that are not UTF-8"
-            )
         made = ScratchFolder()
     except OSError as error:
         raise UserError(
@@ -79,10 +69,6 @@ def load_libsumo() -> Any:
     """
     try:
         libsumo = importlib.import_module("libsumo")
-    except ModuleNotFoundError as error:
-        raise UserError(
-            f"libsumo is not installed: run `pip install libsumo=={SUMO_VERSION}`"
-        ) from error
     except ImportError as error:
         raise _library_missing("libsumo", str(error)) from error
     version = str(libsumo.getVersion()[1]).removeprefix("SUMO ")
@@ -97,7 +83,8 @@ def load_libsumo() -> Any:
 
 def _library_missing(name: str, reason: str) -> UserError:
     return UserError(
-        f"{name} cannot be loaded ({reason}): on Debian or Ubuntu run "
+        f"{name} cannot be loaded ({reason}): install libsumo=={SUMO_VERSION} and "
+        f"eclipse-sumo=={SUMO_VERSION} again, and on Debian or Ubuntu run "
         f"`apt-get update && apt-get install -y {DEBIAN_PACKAGES}` as root"
     )
 

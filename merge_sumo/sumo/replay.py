@@ -6,7 +6,6 @@ files that are written from them into a temporary folder.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -157,19 +156,7 @@ def _first(difference: FloatArray) -> tuple[int, ...]:
     return tuple(indices[0]) if indices else ()
 
 
-def check_display() -> None:
-    """Check that sumo-gui has a display.
-
-    Raises:
-        UserError: it has none.
-    """
-    if os.name == "posix" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
-        raise UserError(
-            "sumo-gui needs a display and DISPLAY is not set: use a desktop or xvfb-run"
-        )
-
-
-def open_gui(folder: Path, from_s: float | None = None, *, silent: bool = False) -> int:
+def open_gui(folder: Path, from_s: float | None = None, *, silent: bool = False) -> None:
     """Open a replay folder in sumo-gui and wait until it is closed.
 
     Args:
@@ -177,20 +164,17 @@ def open_gui(folder: Path, from_s: float | None = None, *, silent: bool = False)
         from_s: begin before the first conflict, as in `replay`.
         silent: whether to print no notice of the begin.
 
-    Returns:
-        1 where sumo-gui failed, else 0.
-
     Raises:
-        UserError: there is no display, or the folder is not a replay folder.
+        UserError: sumo-gui failed, or the folder is not a replay folder.
     """
-    check_display()
     episode = _read(folder)
     first, begins = Conflict.of(episode.trajectory).begin(from_s)
     if not silent:
         for sentence in begins:
             notice(sentence)
     with stopping_in_order(), _staged(episode, first) as (stage, arguments):
-        return int(run_program("sumo-gui", arguments, stage, limit_s=None) != "")
+        if run_program("sumo-gui", arguments, stage, limit_s=None):
+            raise UserError("sumo-gui failed: it needs a desktop, or xvfb-run")
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,25 +12,19 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from merge_sumo.errors import UserError
-from merge_sumo.sumo.binding import SUMO_VERSION, sumo_program
+from merge_sumo.sumo.binding import sumo_program
 
 
 def load_traci() -> Any:
     """Return SUMO's own client, which comes with its programs.
 
     Raises:
-        UserError: if it is missing.
+        UserError: SUMO's programs are missing.
     """
     tools = str(Path(sumo_program("sumo")).parents[1] / "tools")
     if tools not in sys.path:
         sys.path.append(tools)
-    try:
-        return importlib.import_module("traci")
-    except ImportError as error:
-        raise UserError(
-            f"SUMO's traci cannot be loaded ({error}): run `pip install traci=={SUMO_VERSION}`"
-        ) from error
+    return importlib.import_module("traci")
 
 
 @cache
