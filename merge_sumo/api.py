@@ -3,7 +3,7 @@
 import merge_sumo as ms
 
 run = ms.campaign("design2", cases=400, seed=1)
-run.failures        # rows for pandas.DataFrame(run.failures); a table in a notebook
+run.failures        # rows for pandas.DataFrame(run.failures)
 run.report()        # path of the HTML report
 
 A VUT is a spec, as after `--vut`, or a class, a function, or an object with `act` or `act_batch`.

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from functools import cached_property
-from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -19,11 +18,9 @@ from merge_sumo.metrics.measures import Measures
 from merge_sumo.metrics.outcome import Episode, Outcome
 from merge_sumo.metrics.plausibility import doubts, in_vain, mostly_clipped
 from merge_sumo.metrics.summary import (
-    MESSAGE_CHARACTERS,
     GateResult,
     Summary,
     parse_gates,
-    shortened,
     summarise,
 )
 from merge_sumo.printable import printable
@@ -33,46 +30,14 @@ from merge_sumo.reports.facts import REPEATED, Fact, facts_of
 from merge_sumo.reports.text import comparison_headline, episode_lines, headline, transitions
 from merge_sumo.result import Result
 from merge_sumo.road.scenario_file import SUFFIX
-from merge_sumo.scenario.case import coordinates
-from merge_sumo.scenario.scenario import US23
 from merge_sumo.scenario.trajectory import End, Trajectory
 
-MOST_ROWS = 20
-"""Rows that a notebook shows of a table."""
+Rows = list[dict[str, Any]]
+"""Cases as in `outcomes.jsonl`, which `pandas.DataFrame` takes as they are."""
 
 
-class Table(list[dict[str, Any]]):
-    """Rows of cases, as in `outcomes.jsonl`: a list that `pandas.DataFrame` takes as it is."""
-
-    def __init__(self, outcomes: Iterable[Outcome]) -> None:
-        """Make the rows of outcomes.
-
-        Args:
-            outcomes: outcomes of one scenario.
-        """
-        rows = list(outcomes)
-        super().__init__(outcome.to_record() for outcome in rows)
-        scenario = rows[0].case.scenario if rows else US23
-        # A notebook shows some columns; the rows hold all of `outcomes.jsonl`.
-        self._columns = ["index", "level"]
-        self._columns += [coordinate.field for coordinate in coordinates(scenario)]
-        self._columns += ["end", "score", "dx_m", "dv_mps", "avoidable", "error"]
-
-    def _repr_html_(self) -> str:
-        head = "".join(f"<th>{name}</th>" for name in self._columns)
-        body = ""
-        for row in self[:MOST_ROWS]:
-            cells = "".join(f"<td>{_cell(row[name])}</td>" for name in self._columns)
-            body += f"<tr>{cells}</tr>"
-        more = f"<p>{len(self) - MOST_ROWS} more rows</p>" if len(self) > MOST_ROWS else ""
-        return f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>{more}"
-
-
-def _cell(value: object) -> str:
-    if value is None:
-        return ""
-    text = f"{value:.2f}" if isinstance(value, float) else str(value)
-    return escape(shortened(text, MESSAGE_CHARACTERS))
+def _rows(outcomes: Iterable[Outcome]) -> Rows:
+    return [outcome.to_record() for outcome in outcomes]
 
 
 class CampaignRun(Result):
@@ -105,24 +70,24 @@ class CampaignRun(Result):
         return self.recorded.record
 
     @property
-    def cases(self) -> Table:
+    def cases(self) -> Rows:
         """All cases, in the order in which they were chosen."""
-        return Table(self.recorded.outcomes)
+        return _rows(self.recorded.outcomes)
 
     @property
-    def failures(self) -> Table:
+    def failures(self) -> Rows:
         """The failing cases, the worst first."""
-        return Table(failures(self.recorded.cases))
+        return _rows(failures(self.recorded.cases))
 
     @property
-    def errors(self) -> Table:
+    def errors(self) -> Rows:
         """The cases that ended in an error of the VUT or of the simulation, with the message."""
-        return Table(o for o in self.recorded.outcomes if o.measures.end.is_error)
+        return _rows(o for o in self.recorded.outcomes if o.measures.end.is_error)
 
     @property
-    def timeouts(self) -> Table:
+    def timeouts(self) -> Rows:
         """The cases in which the VUT never merged."""
-        return Table(o for o in self.recorded.outcomes if o.measures.end is End.TIMEOUT)
+        return _rows(o for o in self.recorded.outcomes if o.measures.end is End.TIMEOUT)
 
     @cached_property
     def repeats(self) -> list[SecondRun]:
@@ -145,11 +110,11 @@ class CampaignRun(Result):
         return compare_against(self.recorded)
 
     @property
-    def regressions(self) -> Table:
+    def regressions(self) -> Rows:
         """The cases that broke, the worst first: they pass with the earlier version alone."""
         cases = [] if self.against is None else self.against.version_changes[0].cases
         broke = [case.later.index for case in cases if case.change is Change.BROKE]
-        return Table(self.recorded.outcome(index) for index in broke)
+        return _rows(self.recorded.outcome(index) for index in broke)
 
     @cached_property
     def gates(self) -> list[GateResult]:
