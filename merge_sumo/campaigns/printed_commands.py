@@ -7,8 +7,6 @@ from __future__ import annotations
 
 import json
 import re
-import sys
-import sysconfig
 from collections.abc import Iterator, Mapping, Sequence
 from keyword import iskeyword
 from pathlib import Path
@@ -17,7 +15,7 @@ from typing import Any
 from merge_sumo.controllers.kinds import parse, runs_code
 from merge_sumo.controllers.python import object_of
 from merge_sumo.controllers.signatures import is_code
-from merge_sumo.controllers.spec import HERE, PYTHON, ControllerSpec
+from merge_sumo.controllers.spec import HERE
 from merge_sumo.printable import quoted
 
 CONTROLLERS = ("vut", "pov", "against")
@@ -74,9 +72,6 @@ def command(verb: str, *arguments: Argument, **options: Argument | None) -> str:
             continue
         for word in _words(value):
             words += [_flag(name), word]
-    folders = dict.fromkeys(filter(None, map(_folder_of_module, specs)))
-    if folders:
-        words.insert(0, f"PYTHONPATH={quoted(':'.join(folders))}")
     return " ".join(words)
 
 
@@ -113,22 +108,6 @@ def _words(argument: Argument) -> Iterator[str]:
             yield quoted(str(item))
     else:
         yield str(argument)
-
-
-def _folder_of_module(spec: ControllerSpec) -> str:
-    """Return the folder of a module that a new process does not look into by itself; "" for none.
-
-    The caller may have put it into the path, as pytest does.
-    """
-    name = spec.argument.rpartition(":")[0]
-    file = getattr(sys.modules.get(name.partition(".")[0]), "__file__", None)
-    if spec.kind != PYTHON or name.endswith(".py") or file is None:
-        return ""
-    folder = Path(file).resolve().parent
-    if Path(file).name == "__init__.py":
-        folder = folder.parent
-    installed = map(Path, sysconfig.get_paths().values())
-    return "" if folder in (Path.cwd(), *installed) else str(folder)
 
 
 def _controller(text: str) -> str:

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import os
 import re
 import shlex
 import signal
-import subprocess
 import sys
 import warnings
 from collections.abc import Callable, Iterator
@@ -19,7 +17,6 @@ from support.calling import Said
 from support.campaigning import campaign_settings, run_campaign
 
 import merge_sumo as ms
-from merge_sumo import testing
 from merge_sumo.campaigns.printed_commands import campaign_command, command
 from merge_sumo.interrupt import Stopped
 
@@ -42,7 +39,7 @@ class MyVut:
 """
 FEW = {"probability": ["--cases", "8"], "campaign": ["--cases", "4", "--level", "0"]}
 """Options with which the commands of the longest verbs take seconds."""
-A_COMMAND = re.compile(r"(?:PYTHONPATH=\S+ )?(?:merge-sumo|ms\.\w+\(|&& merge-sumo).*")
+A_COMMAND = re.compile(r"(?:merge-sumo|ms\.\w+\(|&& merge-sumo).*")
 
 
 def commands_in(text: str) -> Iterator[str]:
@@ -182,25 +179,6 @@ class TestACommand:
             assert command("campaign", vut=spec) == f"ms.campaign(vut={said})"
         mixed = command("rerun", Path("run"), [1, 2], vut="a.py:B", pov="here:MyVut")
         assert mixed == 'ms.rerun("run", [1, 2], vut="a.py:B", pov=MyVut)'
-
-    def test_finds_a_module_that_only_this_process_finds(self, place, monkeypatch):
-        """As pytest does with a folder of tests."""
-        (place / "tests").mkdir()
-        (place / "tests" / "only_here.py").write_text(SOURCE)
-        monkeypatch.syspath_prepend(place / "tests")
-        vut = __import__("only_here").MyVut
-        with pytest.raises(AssertionError, match="run it again: ") as raised:
-            testing.assert_no_failures(vut, level=0, cases=4, fail_when="t_end_s > 0", out="run")
-        (line,) = (one for one in str(raised.value).splitlines() if "run it again: " in one)
-        text = line.partition("run it again: ")[2]
-        assert text.startswith("PYTHONPATH=")
-        environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
-        path = f"{Path(sys.executable).parent}{os.pathsep}{environment['PATH']}"
-        environment["PATH"] = path
-        done = subprocess.run(
-            ["/bin/sh", "-c", text], env=environment, capture_output=True, text=True, check=False
-        )
-        assert done.returncode == 1, done.stderr
 
 
 def test_an_explanation_by_another_vut_names_it(command_line, tmp_path):
