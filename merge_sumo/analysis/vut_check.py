@@ -164,7 +164,7 @@ def _memory_faults(
 def _differences(when: str, before: Sequence[Trajectory], after: Sequence[Trajectory]) -> list[str]:
     """Return a sentence on the first two motions that differ and should be the same, if any."""
     for one, other in zip(before, after, strict=True):
-        from_s, _ = difference(one, other)
+        from_s = difference(one, other)
         if from_s is not None:
             return [f"After {when} it drives differently from t = {from_s:g} s on."]
     return []

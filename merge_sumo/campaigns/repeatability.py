@@ -24,7 +24,7 @@ from merge_sumo.files import replace_own
 from merge_sumo.metrics.outcome import Episode, Outcome
 from merge_sumo.printable import counted
 from merge_sumo.records import Record, read_indexed, to_json
-from merge_sumo.scenario.scenario import DT_S, OWN, VEHICLES, EpisodeTime, Vehicle
+from merge_sumo.scenario.scenario import DT_S, OWN, EpisodeTime
 from merge_sumo.scenario.trajectory import End, Trajectory
 from merge_sumo.simulation.evaluate import lost_episode, simulate_part, with_measures
 from merge_sumo.simulation.plan import SimulationPlan
@@ -43,7 +43,6 @@ class SecondRun(Record, frozen=True, forbid_unknown_fields=False):
     Attributes:
         index: of the case.
         differs_from_s: time of the first step with another motion; None where all is the same.
-        first: the vehicle that differs first; None where none does, or not one alone.
         end: how the case ended the second time.
         failed: whether it failed the second time.
         other_verdict: whether it ended or failed otherwise than the first time.
@@ -51,7 +50,6 @@ class SecondRun(Record, frozen=True, forbid_unknown_fields=False):
 
     index: int
     differs_from_s: EpisodeTime | None
-    first: Vehicle | None
     end: End
     failed: bool
     other_verdict: bool
@@ -136,13 +134,13 @@ def second_run_of(outcome: Outcome, trajectory: Trajectory, second: Episode) -> 
         trajectory: trajectory of the first run.
         second: the second run.
     """
-    differs_from_s, first = difference(trajectory, second.trajectory)
+    differs_from_s = difference(trajectory, second.trajectory)
     end, failed = second.outcome.measures.end, second.outcome.failed
     other_verdict = (end, failed) != (outcome.measures.end, outcome.failed)
-    return SecondRun(outcome.index, differs_from_s, first, end, failed, other_verdict)
+    return SecondRun(outcome.index, differs_from_s, end, failed, other_verdict)
 
 
-def difference(one: Trajectory, other: Trajectory) -> tuple[float | None, Vehicle | None]:
+def difference(one: Trajectory, other: Trajectory) -> float | None:
     """Compare the motions of two runs of a case.
 
     Args:
@@ -150,8 +148,7 @@ def difference(one: Trajectory, other: Trajectory) -> tuple[float | None, Vehicl
         other: another run.
 
     Returns:
-        The time in s from which they differ, None where they do not, and the vehicle that differs
-        first, None where several do.
+        The time in s from which they differ; None where they do not.
     """
     rows = min(len(one.whole), len(other.whole))
     first, second = one.whole[:rows].copy(), other.whole[:rows].copy()
@@ -159,13 +156,9 @@ def difference(one: Trajectory, other: Trajectory) -> tuple[float | None, Vehicl
     differs = first != second
     steps = np.flatnonzero(differs.any(axis=(1, 2)))
     if len(steps):
-        step = int(steps[0])
-        # The acceleration of a step is the answer to its state, which was the same.
-        vehicles = np.flatnonzero(differs[step, :, 2])
-        vehicle = VEHICLES[vehicles[0]] if len(vehicles) == 1 else None
-        return round(step * DT_S, 1), vehicle
+        return round(int(steps[0]) * DT_S, 1)
     same = len(one.whole) == len(other.whole)
-    return (None if same else round((rows - 1) * DT_S, 1)), None
+    return None if same else round((rows - 1) * DT_S, 1)
 
 
 def read_second_runs(run: RecordedCampaign) -> list[SecondRun]:
@@ -192,12 +185,10 @@ def unrepeatable(second_runs: Sequence[SecondRun]) -> str | None:
     verdicts = [second for second in differing if second.other_verdict]
     example = (verdicts or differing)[0]
     since = "" if example.differs_from_s is None else f" from {example.differs_from_s:g} s on"
-    firsts = {second.first for second in differing}
-    who = "VUT or the POV" if len(firsts) > 1 else str(firsts.pop() or "VUT or the POV").upper()
     return (
         f"Not repeatable: {len(differing)} of {counted(len(second_runs), 'case')} that ran twice "
         f"went differently the second time, {len(verdicts) or 'none'} of them with another verdict "
-        f"(case {example.index}{since}). Either the {who} draws random numbers or reads a clock, "
-        "or it keeps something from earlier episodes: a result depends on more than its case, and "
+        f"(case {example.index}{since}). A controller draws random numbers or reads a clock, or "
+        "it keeps something from earlier episodes: a result depends on more than its case, and "
         "other workers or another order may give others."
     )
