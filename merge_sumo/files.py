@@ -213,12 +213,12 @@ def _holds(path: Path, files: Mapping[str, bytes]) -> bool:
         return False
 
 
-@contextmanager
-def new_file(path: Path, option: str = "`out`") -> Iterator[BinaryIO]:
-    """Give a new file to write; it is at `path` in the end, or nowhere.
+def write_new(path: Path, content: bytes, option: str = "`out`") -> None:
+    """Write a new file; it is there whole, or not at all.
 
     Args:
         path: the file.
+        content: its bytes.
         option: what names it in the message.
 
     Raises:
@@ -229,7 +229,7 @@ def new_file(path: Path, option: str = "`out`") -> Iterator[BinaryIO]:
             raise _exists(path, option)
         path.parent.mkdir(parents=True, exist_ok=True)
         with _temporary(path) as (new, file):
-            yield file
+            file.write(content)
             file.flush()
             try:
                 os.link(new, path, follow_symlinks=False)  # refuses a name taken since
@@ -237,21 +237,6 @@ def new_file(path: Path, option: str = "`out`") -> Iterator[BinaryIO]:
                 raise _exists(path, option) from error
             except (OSError, NotImplementedError):  # a file system without hard links
                 new.rename(path)
-
-
-def write_new(path: Path, content: bytes, option: str = "`out`") -> None:
-    """Write a new file.
-
-    Args:
-        path: the file.
-        content: its bytes.
-        option: what names it in the message.
-
-    Raises:
-        UserError: something is there, or it cannot be written.
-    """
-    with new_file(path, option) as file:
-        file.write(content)
 
 
 def replace_own(path: Path, content: bytes, mark: bytes = b"") -> None:
