@@ -19,8 +19,8 @@ from merge_sumo.errors import UserError
 from merge_sumo.scenario.imperfection import ACT, SENSE, Actuation, Sensing, check_amount
 from merge_sumo.scenario.scenario import (
     ALL_LEVELS,
-    IMPERFECTIONS,
     LEVELS,
+    OPTIONAL,
     OWN,
     SVO,
     US23,
@@ -98,7 +98,7 @@ class Case:
             ("draw", self.draw, 0, MOST_DRAWS - 1),
         ):
             check_amount(name, value, (low, high))
-        self._check_imperfections()
+        self._check_ranges()
         self._check_headways()
 
     def _check_headways(self) -> None:
@@ -106,8 +106,6 @@ class Case:
         reach_m, least_m = self.scenario.reach_m, self.scenario.pov_length_m
         for name, side in (("headway_ahead_s", 1.0), ("headway_behind_s", -1.0)):
             headway_s = getattr(self, name)
-            if (headway_s is not None) != (self.scenario.vehicles > 2):
-                raise UserError(f"{name} belongs to traffic: give it there, and only there")
             if headway_s is None:
                 continue
             apart_m = headway_s * self.v_pov0_mps
@@ -156,10 +154,10 @@ class Case:
         # A CRC continues from another one, and differs for different bytes of the same number.
         return first if self.draw == 0 else zlib.crc32(self.draw.to_bytes(4, "little"), first)
 
-    def _check_imperfections(self) -> None:
+    def _check_ranges(self) -> None:
         """Raise `UserError` where a range has no number, or a number no range."""
-        ranges = self.scenario.imperfect_fields
-        for coordinate in IMPERFECTIONS:
+        ranges = self.scenario.optional_fields
+        for coordinate in OPTIONAL:
             if (coordinate.of(self) is not None) != (coordinate.field in ranges):
                 raise UserError(
                     f"{coordinate.field} belongs to a range of the scenario: give it there alone"

@@ -11,8 +11,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Self
 
-from merge_sumo.errors import UserError
-from merge_sumo.printable import either, meant
+from merge_sumo.errors import UserError, explained
+from merge_sumo.records import convert
 
 Bounds = tuple[float, float]
 Amount = float | Bounds
@@ -113,24 +113,12 @@ class Imperfection:
         Raises:
             UserError: a name is unknown, or a number is missing or wrong.
         """
-        known = list(cls.possible)
-        values: dict[str, Amount] = {}
+        values: dict[str, str | list[str]] = {}
         for part in text.split(","):
             name, _, number = part.strip().partition("=")
-            if name not in known or name in values:
-                hint = meant(name, known) or f"give NAME=NUMBER, with a name of {either(known)}"
-                raise UserError(f"{option}: {name!r:.60} is unknown or given twice: {hint.strip()}")
-            low, dots, high = number.partition("..")
-            try:
-                values[name] = (float(low), float(high)) if dots else float(low)
-            except ValueError:
-                raise UserError(
-                    f"{option}: {name} is {number!r:.60}: give a number, or a range as 0..0.5"
-                ) from None
-        try:
-            return cls(**values)
-        except UserError as error:
-            raise UserError(f"{option}: {error}") from error
+            values[name] = number.split("..") if ".." in number else number
+        with explained(option):
+            return convert(values, cls, strict=False)
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

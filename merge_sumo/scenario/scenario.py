@@ -143,7 +143,9 @@ class Coordinate:
 
 SVO = Coordinate("svo_rad", "psi", "rad", 2, "$\\psi$ (rad)", 0.0, math.pi / 2)
 """Orientation psi in [0, pi/2)."""
-IMPERFECTIONS = (
+OPTIONAL = (
+    Coordinate("headway_ahead_s", "headway ahead", "s", 2),
+    Coordinate("headway_behind_s", "headway behind", "s", 2),
     Coordinate("sense_delay_s", "sensing delay", "s", 2),
     Coordinate("sense_noise_x_m", "noise of x", "m", 2),
     Coordinate("sense_noise_v_mps", "noise of v", "m/s", 2),
@@ -154,14 +156,12 @@ IMPERFECTIONS = (
     Coordinate("act_delay_s", "actuator delay", "s", 2),
     Coordinate("act_power_w_per_kg", "power", "W/kg", 1),
 )
-"""Coordinates for ranges of `sense` and `act`."""
+"""Coordinates that a scenario may have: headways, and ranges of `sense` and `act`."""
 COORDINATES = (
     Coordinate("x_pov0_m", "x_POV0", "m", 1, "$x_{POV}^0$ (m)"),
     Coordinate("v_pov0_mps", "v_POV0", "m/s", 2, "$v_{POV}^0$ (m/s)"),
     Coordinate("v_vut0_mps", "v_VUT0", "m/s", 2, "$v_{VUT}^0$ (m/s)"),
-    Coordinate("headway_ahead_s", "headway ahead", "s", 2),
-    Coordinate("headway_behind_s", "headway behind", "s", 2),
-    *IMPERFECTIONS,
+    *OPTIONAL,
 )
 """Coordinates of the pool in order, except the SVO. A scenario has those with a range."""
 
@@ -182,23 +182,16 @@ EpisodeTime = Annotated[float, Meta(ge=0.0, le=MAX_EPISODE_S)]
 """A time of an episode in a record, in s."""
 
 
-def rgb(vehicle: str) -> tuple[int, int, int]:
-    """Return the colour of a vehicle as red, green and blue between 0 and 255.
-
-    Args:
-        vehicle: one of `VEHICLES`.
-    """
-    red, green, blue = bytes.fromhex(COLOURS[vehicle][1:])
-    return red, green, blue
-
-
+LEAST = 0.01
+"""Least amount of a number that must be above or below 0."""
 _LENGTH_M = (0.1, 100.0)
 _SPEED_MPS = (0.0, 100.0)
+_TARGET_MPS = (LEAST, 100.0)
 _HEADWAY_S = (0.0, 60.0)
 RANGES: dict[str, Bounds] = {
     "x_pov0_m": (-5000.0, 0.0),
     "v_pov0_mps": _SPEED_MPS,
-    "x_vut0_m": (-5000.0, 0.0),
+    "x_vut0_m": (-5000.0, -LEAST),
     "v_vut0_mps": _SPEED_MPS,
     "headway_ahead_s": _HEADWAY_S,
     "headway_behind_s": _HEADWAY_S,
@@ -206,18 +199,18 @@ RANGES: dict[str, Bounds] = {
     "min_gap_m": (0.0, 100.0),
     "pov_length_m": _LENGTH_M,
     "vut_length_m": _LENGTH_M,
-    "a_min_mps2": (-20.0, 0.0),
-    "a_max_mps2": (0.0, 20.0),
+    "a_min_mps2": (-20.0, -LEAST),
+    "a_max_mps2": (LEAST, 20.0),
     "timeout_s": (DT_S, MAX_EPISODE_S),
     "follow_up_s": (0.0, MAX_FOLLOW_UP_S),
-    "v_hw_min_mps": _SPEED_MPS,
+    "v_hw_min_mps": _TARGET_MPS,
     "v_hw_max_mps": _SPEED_MPS,
-    "v_min_mps": _SPEED_MPS,
-    "ttc_min_s": (0.0, 100.0),
-    "dx_crash_m": (0.0, 1000.0),
+    "v_min_mps": _TARGET_MPS,
+    "ttc_min_s": (LEAST, 100.0),
+    "dx_crash_m": (LEAST, 1000.0),
     "dx_critical_m": (0.0, 1000.0),
-    "level0_a_mps2": (0.0, 20.0),
-    "level0_v_mps": _SPEED_MPS,
+    "level0_a_mps2": (LEAST, 20.0),
+    "level0_v_mps": _TARGET_MPS,
     "reach_m": (0.0, 5000.0),
     "v_start_max_mps": _SPEED_MPS,
     "lane_m": (-2000.0, 2000.0),
@@ -341,13 +334,9 @@ class Scenario:
         begin_m, end_m = self.lane_m or (0.0, 1.0)
         around = "[begin, end] of the lane: begin from x_vut0_m to 0, end above 0"
         yield "lane_m", self.x_vut0_m <= begin_m <= 0.0 < end_m, around
-        for name in ("x_vut0_m", "a_min_mps2"):
-            yield name, getattr(self, name) < 0.0, "below 0"
-        for name in ("a_max_mps2", "v_min_mps", "ttc_min_s", "level0_v_mps"):
-            yield name, getattr(self, name) > 0.0, "above 0"
-        yield "v_hw_min_mps", 0.0 < self.v_hw_min_mps < self.v_hw_max_mps, "below v_hw_max_mps"
-        yield "dx_crash_m", 0.0 < self.dx_crash_m <= self.dx_critical_m, "up to dx_critical_m"
-        yield "level0_a_mps2", 0.0 < self.level0_a_mps2 <= self.a_max_mps2, "up to a_max_mps2"
+        yield "v_hw_min_mps", self.v_hw_min_mps < self.v_hw_max_mps, "below v_hw_max_mps"
+        yield "dx_crash_m", self.dx_crash_m <= self.dx_critical_m, "up to dx_critical_m"
+        yield "level0_a_mps2", self.level0_a_mps2 <= self.a_max_mps2, "up to a_max_mps2"
 
     def to_record(self) -> dict[str, Any]:
         """Return the scenario for JSON: its fields, without perfect parts and an unused lane."""
@@ -433,9 +422,9 @@ class Scenario:
         return (*ranges, SVO) if level == 2 else tuple(ranges)
 
     @property
-    def imperfect_fields(self) -> tuple[str, ...]:
-        """Fields of a case for the ranges of `sense` and `act`."""
-        ranges = [c.field for c in IMPERFECTIONS if isinstance(self._amount(c), tuple)]
+    def optional_fields(self) -> tuple[str, ...]:
+        """Fields of a case for headways, and for the ranges of `sense` and `act`."""
+        ranges = [c.field for c in OPTIONAL if isinstance(self._amount(c), tuple)]
         return tuple(ranges)
 
     def _amount(self, coordinate: Coordinate) -> Any:
@@ -448,9 +437,8 @@ class Scenario:
     @property
     def case_fields(self) -> tuple[str, ...]:
         """Fields of a case that a record names, except its level."""
-        headways = ("headway_ahead_s", "headway_behind_s") if self.vehicles > 2 else ()
         own = ("x_pov0_m", "v_pov0_mps", "v_vut0_mps", "svo_rad")
-        return (*own, *headways, *self.imperfect_fields)
+        return (*own, *self.optional_fields)
 
     def has_ended(self, x_m: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Return whether the VUT has passed M, or the end of the acceleration lane.

@@ -16,7 +16,7 @@ from lxml import etree
 from merge_sumo.errors import UserError
 from merge_sumo.road.road import LanePath, LanePoint, Road
 from merge_sumo.road.xml_input import harmless_net, to_bytes
-from merge_sumo.scenario.scenario import DT_S, VEHICLES, VUT, Scenario, rgb
+from merge_sumo.scenario.scenario import COLOURS, DT_S, VEHICLES, VUT, Scenario
 from merge_sumo.sumo.binding import SPEED_MODE_COMMANDED, SUMO_OPTIONS, load_libsumo
 
 NET = "road.net.xml"
@@ -26,7 +26,7 @@ OPTIONS = (*SUMO_OPTIONS, "--collision.action", "warn")
 """SUMO reports collisions, which change nothing."""
 DEPARTURE_SPEED_MODE = 38
 """Speed mode in which the VUT departs: its limits of acceleration act, SUMO's safety checks not."""
-COLOURS = (*rgb("pov"), 255), (*rgb("vut"), 255)
+RGBA = [tuple(bytes.fromhex(f"{COLOURS[name][1:]}ff")) for name in ("pov", "vut")]
 """Colours of the cars of the mainline, and of the VUT."""
 FASTEST_MPS = 45.0
 """Least maximum speed of a vehicle, where the road allows less; the limit of the shipped road."""
@@ -175,7 +175,7 @@ class MirrorSimulation:
         """
         self._searches += 1  # an object that has found others keeps them up to the next step
         name = f"around {self._searches}"
-        self.call("poi.add", name, *point[:2], COLOURS[0])
+        self.call("poi.add", name, *point[:2], RGBA[0])
         try:
             self.call("poi.subscribeContext", name, domain, range_m, [ID_COUNT])
             found = set(self.call("poi.getContextSubscriptionResults", name))
@@ -193,7 +193,7 @@ class MirrorSimulation:
         vehicle, self.merged = self._libsumo.vehicle, False
         for name, state in states.items():
             vehicle.add(name, f"route.{name}", typeID=name, **self._departure(name, state))
-            vehicle.setColor(name, COLOURS[name == VUT_ID])
+            vehicle.setColor(name, RGBA[name == VUT_ID])
             self.at_m[name] = state[0]
         self.departed += states
         self.step()

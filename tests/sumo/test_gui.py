@@ -12,13 +12,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from lxml import etree
-from PIL import Image
+from PIL import Image, ImageColor
 
 from merge_sumo.campaigns.campaign import export_case
 from merge_sumo.campaigns.recorded import failures
 from merge_sumo.metrics.cause import cause
 from merge_sumo.metrics.merge import Conflict
-from merge_sumo.scenario.scenario import DT_S, rgb
+from merge_sumo.scenario.scenario import COLOURS, DT_S
 from merge_sumo.sumo.replay_folder import LABELS, VIEW
 
 PICTURE_TIMES_S = (2.0, 7.0)
@@ -109,7 +109,7 @@ def places(image: np.ndarray, colour: tuple[float, ...]) -> np.ndarray:
 def car(image: np.ndarray, who: str) -> np.ndarray:
     """Return the pixels of a car, which is below the labels."""
     labels = round(LABELS_SHARE * image.shape[0])
-    return np.array([labels, 0]) + places(image[labels:], rgb(who))
+    return np.array([labels, 0]) + places(image[labels:], ImageColor.getrgb(COLOURS[who]))
 
 
 def test_the_cars_meet(pictures):
@@ -145,4 +145,4 @@ def test_the_window_has_the_case_its_cause_and_the_colours_of_the_report(run, pi
         top = image[: round(LABELS_SHARE * image.shape[0])]
         assert len(places(top, (26.0, 26.0, 26.0))) > 100, "a text"
         for who in ("pov", "vut"):
-            assert len(places(top, rgb(who))) > 20, "a dot of the legend"
+            assert len(places(top, ImageColor.getrgb(COLOURS[who]))) > 20, "a dot of the legend"
