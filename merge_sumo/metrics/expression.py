@@ -10,14 +10,13 @@ two texts 1; `and` is the largest of its parts, `or` the smallest, and `not` cha
 from __future__ import annotations
 
 import ast
-import re
 import sys
 import warnings
 from collections.abc import Callable, Mapping, Sequence, Set
 from typing import Any, NamedTuple
 
 from merge_sumo.errors import UserError
-from merge_sumo.printable import either, meant, nearest, printable
+from merge_sumo.printable import either, meant, printable
 
 Value = float | str
 """A number, which may be infinite, or a text."""
@@ -30,8 +29,6 @@ MOST_CHARACTERS = 1000
 
 Vocabulary = Mapping[str, Set[str] | None]
 """The known values by name: the possible texts, or None for a number."""
-OTHER_SIGNS = re.compile(r"&&?|\|\|?|!(?!=)|(?<![=<>!])=(?!=)")
-"""Operators of other languages."""
 
 
 class Condition(NamedTuple):
@@ -74,11 +71,9 @@ def parse_condition(
         _check_length(written)
         return _Parser(vocabulary, what, named).condition(tree), written
     except (SyntaxError, ValueError, MemoryError, RecursionError) as error:
-        sign = OTHER_SIGNS.search(text)
-        hint = f": write and, or, not, == or < instead of {sign[0]}" if sign else ""
         raise UserError(
             f"{what} is not an expression over measures such as "
-            f"'ttc_s < 1.5 or end == \"TIMEOUT\"'{hint}"
+            "'ttc_s < 1.5 or end == \"TIMEOUT\"', with and, or, not and comparisons as in Python"
         ) from error
 
 
@@ -110,15 +105,13 @@ class _Parser:
                 return _joined(comparisons, every=True)
             case ast.Name(id=name) if name in self._named:
                 return self.condition(ast.parse(self._named[name], mode="eval").body)
-            case ast.Name(id=name) if name in self._vocabulary:
-                raise self._error(f"{name} stands alone: compare it with something")
-            case ast.Name(id=name):
+            case ast.Name(id=name) if name not in self._vocabulary:
                 raise self._unknown(name)
         shown = printable(ast.unparse(node)[:60])
         raise self._error(f"{shown} is not a condition: write comparisons, and, or, not, brackets")
 
     def _comparison(self, first: ast.expr, sign: ast.cmpop, second: ast.expr) -> Condition:
-        left, right = self._side(first, second), self._side(second, first)
+        left, right = self._side(first), self._side(second)
         names = [side for side in (left, right) if isinstance(side, str)]
         texts = [side.value for side in (left, right) if isinstance(side, ast.Constant)]
         if texts or any(self._vocabulary[name] for name in names):
@@ -140,23 +133,16 @@ class _Parser:
         if not isinstance(sign, ast.Eq | ast.NotEq):
             raise self._error(f"{name} is a text: compare it with == or !=")
         if text not in choices:
-            known = sorted(choices)
-            hint = f"{meant(text, known)}it is {either(known)}"
-            raise self._error(f"{name} is never {text!r}: {hint}")
+            raise self._error(f"{name} is never {text!r}: it is {either(sorted(choices))}")
         met = Condition(lambda values: -1.0 if values[name] == text else 1.0, frozenset({name}))
         return met if isinstance(sign, ast.Eq) else _negated(met)
 
-    def _side(self, node: ast.expr, other: ast.expr) -> Any:
+    def _side(self, node: ast.expr) -> Any:
         """Return the name of a measure, a number, or the constant of a text."""
         match node:
             case ast.Name(id=name) if name in self._vocabulary:
                 return name
             case ast.Name(id=name):
-                texts = self._vocabulary.get(other.id) if isinstance(other, ast.Name) else None
-                if near := nearest(name, sorted(texts or ())):
-                    raise self._error(
-                        f'write the text in quotes: {ast.unparse(other)} == "{near[0]}"'
-                    )
                 raise self._unknown(name)
             case ast.Constant(value=str()):
                 return node
@@ -166,7 +152,7 @@ class _Parser:
                     raise self._error("a number is to be finite")
                 return float(number)
             case ast.UnaryOp(op=ast.USub(), operand=ast.Constant() as constant):
-                number = self._side(constant, other)
+                number = self._side(constant)
                 if isinstance(number, float):
                     return -number
         shown = printable(ast.unparse(node)[:60])
@@ -175,7 +161,7 @@ class _Parser:
     def _unknown(self, name: str) -> UserError:
         hint = meant(name, (*self._vocabulary, *self._named))
         hint = hint or f"choose {', '.join(self._vocabulary)}"
-        return self._error(f"no measure {printable(name)!r}: {hint.strip()}")
+        return self._error(f"no measure {printable(name)!r} (a text is in quotes): {hint.strip()}")
 
     def _error(self, why: str) -> UserError:
         return UserError(f"{self._what}: {why}")

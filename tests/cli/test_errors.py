@@ -21,12 +21,11 @@ from merge_sumo.scenario.scenario import US23
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("ttc_s < 2 or TTC_S < 1", "no measure 'TTC_S': did you mean ttc_s"),
-        ("merged_first == VUT", 'write the text in quotes: merged_first == "VUT"'),
+        ("ttc_s < 2 or TTC_S < 1", "no measure 'TTC_S' (a text is in quotes): did you mean ttc_s"),
+        ("merged_first == VUT", "no measure 'VUT' (a text is in quotes)"),
         ("merged_first == level0", "no measure 'level0'"),
-        ("end == 'timeout'", "end is never 'timeout': did you mean TIMEOUT?"),
-        ("ttc_s = 2", "instead of ="),
-        ("ttc_s < 2 && dx_m > 3", "instead of &&"),
+        ("end == 'timeout'", "end is never 'timeout': it is MERGED or TIMEOUT"),
+        ("ttc_s < 2 && dx_m > 3", "with and, or, not and comparisons as in Python"),
     ],
 )
 def test_a_condition_is_refused_with_what_was_meant(text, said):
