@@ -15,7 +15,7 @@ from merge_sumo.metrics.cause import cause
 from merge_sumo.reports.pages import X_AXIS, page
 from merge_sumo.reports.text import change_in_words, comparison_headline, fmc_rows
 from merge_sumo.scenario.case import FloatArray, coordinates
-from merge_sumo.scenario.scenario import DT_S, VEHICLES, VUT
+from merge_sumo.scenario.scenario import VEHICLES, VUT
 
 SHOWN = 200
 """Maximum number of cases of a change of version that are drawn, in the order of tables."""
@@ -83,8 +83,7 @@ def _maps(version_change: VersionChange) -> dict[int, Any]:
 def _sections(version_change: VersionChange, compared: Comparison) -> list[tuple[Change, int, Any]]:
     """Return a section for each change: the change, its number of cases, a row for each case shown.
 
-    A row has the case, its versions (number, folder, outcome, cause), the charts, and the time of
-    the first difference of the motions.
+    A row has the case, its versions (number, folder, outcome, cause), and the charts.
     """
     sections, left = [], SHOWN
     for change in DRAWN:
@@ -103,23 +102,10 @@ def _sections(version_change: VersionChange, compared: Comparison) -> list[tuple
                 versions.append((number, version.folder, outcome, cause(outcome, motion)))
                 if motion is not None:
                     motions[name] = motion.whole
-            rows.append((one, versions, _charts(motions), _differ_s(motions)))
+            rows.append((one, versions, _charts(motions)))
         if cases:
             sections.append((change, len(cases), rows))
     return sections
-
-
-def _differ_s(motions: Mapping[str, FloatArray]) -> float | None:
-    """Return when two motions, (T + 1, A, 3), begin to differ; None where they do not."""
-    if len(motions) < 2:
-        return None
-    earlier, later = motions.values()
-    rows = min(len(earlier), len(later))
-    # In m, m/s and m/s2: smaller differences cannot be seen.
-    apart = (np.abs(earlier[:rows] - later[:rows]) > 0.005).any(axis=(1, 2))
-    if apart.any():
-        return round(int(apart.argmax()) * DT_S, 1)
-    return None if len(earlier) == len(later) else round((rows - 1) * DT_S, 1)
 
 
 def _charts(motions: Mapping[str, FloatArray]) -> list[dict[str, Any]]:
