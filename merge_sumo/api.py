@@ -80,7 +80,7 @@ from merge_sumo.reports.cases_toml import with_file
 from merge_sumo.reports.comparison_page import PAGE, comparison_page
 from merge_sumo.reports.exports import export_cases
 from merge_sumo.reports.junit import JUNIT, check_junit, write_junit, write_junit_of_comparison
-from merge_sumo.reports.progress import Bars, CampaignBars, Counter
+from merge_sumo.reports.progress import Bars, CampaignBars
 from merge_sumo.reports.report import RunningReport, check_report, write_report
 from merge_sumo.result import Shown
 from merge_sumo.road.scenario_file import SUFFIX
@@ -504,9 +504,10 @@ def opened_study(
     settings = settings_from_folder(run.folder, run.record, named_settings(config))
     plan = settings.load_plan().with_engine(engine)
     number = total if isinstance(total, int) else total[plan.engine]
-    bar = Counter(title, number, unit, shown=config.progress)
-    with open_workers(plan.workers(config.workers)) as workers, bar:
-        yield run_study.RunStudy(run, settings, plan, workers, bar.ended)
+    bars = Bars(shown=config.progress)
+    with open_workers(plan.workers(config.workers)) as workers, bars:
+        ended = bars.counter(title, number, unit)
+        yield run_study.RunStudy(run, settings, plan, workers, ended)
 
 
 @contextmanager

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 import time
 from collections.abc import Callable, Sequence
@@ -18,29 +19,10 @@ from merge_sumo.metrics.summary import summarise
 from merge_sumo.printable import counted, printable
 from merge_sumo.reports.report import REPORT
 
-LINES = 10
-"""Lines of a bar without a terminal; there are more where a line would take `SLOW_S`."""
-SLOW_S = 60.0
-"""Maximum time without a line."""
+LINE_S = 60.0
+"""Minimum time between two lines of a bar without a terminal."""
 REDRAWN_S = 0.25
 """Minimum time between two pictures of a bar on a terminal."""
-
-
-def rate_text(count: float, elapsed_s: float, unit: str) -> str:
-    """Return a readable rate, such as "7,140 cases/s" or "3.5 cases/min".
-
-    Args:
-        count: number of finished items.
-        elapsed_s: time that they took.
-        unit: name of the items.
-    """
-    if count <= 0.0 or elapsed_s <= 0.0:
-        return f"- {unit}/s"
-    rate, per = count / elapsed_s, "s"
-    if rate < 1.0:
-        rate, per = 60.0 * rate, "min"
-    number = f"{rate:,.0f}" if rate >= 10.0 else f"{rate:.1f}"
-    return f"{number} {unit}/{per}"
 
 
 def is_watched() -> bool:
@@ -56,14 +38,14 @@ class _Bar:
     Attributes:
         start_s: time of its first update.
         before: count at its first update.
-        shown_s: time at which it was last shown.
+        shown_s: time at which it was last shown; at first long ago.
         shown: count that was last shown.
         task: task of rich; None while nothing is drawn.
     """
 
     start_s: float
     before: int
-    shown_s: float
+    shown_s: float = -math.inf
     shown: int = 0
     task: TaskID | None = None
 
@@ -71,7 +53,7 @@ class _Bar:
 class Bars:
     """Progress bars by title; a bar appears with its first update.
 
-    Without a terminal, a line is printed after every tenth of a bar.
+    Without a terminal, a line is printed at the begin, every minute, and at the end.
 
     Example:
         >>> with Bars() as bars:
@@ -110,22 +92,20 @@ class Bars:
             note: text after the bar, or a function that makes it when it is shown.
         """
         now_s = time.monotonic()
-        bar = self._bars.setdefault(title, _Bar(now_s, done, now_s))
-        since, since_s = done - bar.shown, now_s - bar.shown_s
-        if self._console.is_terminal:
-            is_due = bar.task is None or since_s >= REDRAWN_S
-        else:
-            is_due = (since_s >= 1.0 and since * LINES >= total) or since_s >= SLOW_S
-        is_last = done >= total and since > 0
+        bar = self._bars.setdefault(title, _Bar(now_s, done))
+        every_s = REDRAWN_S if self._console.is_terminal else LINE_S
+        is_due = now_s - bar.shown_s >= every_s
+        is_last = done >= total and done > bar.shown
         if not self._is_shown or not (is_due or is_last):
             return
         bar.shown, bar.shown_s = done, now_s
         parts = [note if isinstance(note, str) else note()]
         finished, elapsed_s = done - bar.before, now_s - bar.start_s
-        parts.append(rate_text(finished, elapsed_s, unit))
-        if finished > 0 and done < total:
-            left_s = (total - done) * elapsed_s / finished
-            parts.append(f"{timedelta(seconds=round(left_s))} left")
+        if finished > 0 and elapsed_s > 0.0:
+            per_s = finished / elapsed_s
+            parts.append(f"{per_s:.3g} {unit}/s")
+            if done < total:
+                parts.append(f"{timedelta(seconds=round((total - done) / per_s))} left")
         text = "  ".join(filter(None, parts))
         if not self._console.is_terminal:
             self.say(f"{printable(title)}: {done:,}/{total:,}  {text}")
@@ -134,6 +114,24 @@ class Bars:
             self._progress.start()
             bar.task = self._progress.add_task(printable(title), total=total, note="")
         self._progress.update(bar.task, completed=done, note=text)
+
+    def counter(self, title: str, total: int, unit: str) -> Callable[[int], None]:
+        """Return a function that counts further items that have finished.
+
+        Args:
+            title: title of the bar.
+            total: number of all items.
+            unit: name of the items.
+        """
+        finished = 0
+
+        def ended(count: int) -> None:
+            nonlocal finished
+            finished += count
+            self.counted(title, finished, total, unit)
+
+        ended(0)
+        return ended
 
     def say(self, text: str) -> None:
         """Print a line above the bars.
@@ -153,37 +151,6 @@ class Bars:
         if self._progress.live.is_started:
             self._progress.live.transient = error is not None
             self._progress.stop()
-
-
-class Counter(Bars):
-    """A bar of finished items; `ended` is a callback of a study."""
-
-    def __init__(self, title: str, total: int, unit: str, *, shown: bool | None = True) -> None:
-        """Show nothing yet.
-
-        Args:
-            title: title of the bar.
-            total: number of all items.
-            unit: name of the items.
-            shown: whether to show anything; None for only on a terminal and in a notebook.
-        """
-        super().__init__(shown=shown)
-        self._title, self._total, self._unit = title, total, unit
-        self._count = 0
-
-    def __enter__(self) -> Self:
-        """Begin to measure the rate."""
-        self.ended(0)
-        return self
-
-    def ended(self, count: int) -> None:
-        """Count items that have finished.
-
-        Args:
-            count: number of further items.
-        """
-        self._count += count
-        self.counted(self._title, self._count, self._total, self._unit)
 
 
 class CampaignBars(Bars):
