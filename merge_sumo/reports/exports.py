@@ -20,7 +20,7 @@ from merge_sumo.reports.pages import environment
 from merge_sumo.road.loader import road_for
 from merge_sumo.road.road import Road
 from merge_sumo.scenario.case import coordinates
-from merge_sumo.scenario.scenario import DT_S, VEHICLES, VUT, Scenario
+from merge_sumo.scenario.scenario import DT_S, VEHICLES, VUT
 from merge_sumo.scenario.trajectory import Trajectory
 from merge_sumo.sumo.opendrive import opendrive
 
@@ -87,6 +87,8 @@ def export_cases(
 def write_table(run: RecordedCampaign, indices: Sequence[int], target: Path) -> Path:
     """Write the motion of cases, or of all, as one table with a row for each step.
 
+    Its columns are time and motion of all vehicles, the case, its severity, and signals.
+
     Args:
         run: the campaign.
         indices: the cases; all without any.
@@ -99,51 +101,33 @@ def write_table(run: RecordedCampaign, indices: Sequence[int], target: Path) -> 
         UserError: the file exists, or a case has no trajectory.
     """
     rows: list[dict[str, Any]] = []
+    columns: dict[str, Any] = {}
     for index in indices or range(len(run.outcomes)):
-        rows += _rows(run, index)
+        of_case = list(_rows(run, index))
+        columns |= of_case[0]
+        rows += of_case
     path = new_file_in(target, TABLE)
-    signals = dict.fromkeys(name for row in rows for name in row if name.startswith(SIGNAL))
     table = io.StringIO(newline="")
-    writer = csv.DictWriter(table, (*columns_of(run.scenario), *signals))
+    writer = csv.DictWriter(table, columns)
     writer.writeheader()
     writer.writerows(rows)
     write_new(path, table.getvalue().encode())
     return path
 
 
-def columns_of(scenario: Scenario) -> tuple[str, ...]:
-    """Return the columns of a table: time and motion of all vehicles, the case, its severity.
-
-    Args:
-        scenario: scenario of the campaign.
-    """
-    columns = ["case", "level", "time_s", *_motion(scenario)]
-    if scenario.lane_m is not None:
-        columns.append(MERGED)
-    columns += [coordinate.field for coordinate in coordinates(scenario)]
-    return (*columns, "severity")
-
-
-def _motion(scenario: Scenario) -> list[str]:
-    names = []
-    for who in VEHICLES[: scenario.vehicles]:
-        names += [f"x_{who}_m", f"v_{who}_mps", f"a_{who}_mps2"]
-    return names
-
-
 def _rows(run: RecordedCampaign, index: int) -> Iterator[dict[str, Any]]:
     """Yield the rows of a case by column; a text that begins as a formula gets a quote."""
     trajectory, scenario = run.trajectory(index), run.scenario
-    names, merged = _motion(scenario), merged_rows(trajectory)
-    case: dict[str, Any] = {"case": index, "level": trajectory.case.level}
-    for coordinate in coordinates(scenario):
-        case[coordinate.field] = coordinate.of(trajectory.case)
-    case["severity"] = run.outcome(index).measures.severity
+    merged = merged_rows(trajectory)
+    starts = {one.field: one.of(trajectory.case) for one in coordinates(scenario)}
     for step, state in enumerate(trajectory.whole):
-        row = case | {"time_s": round(step * DT_S, 1)}
-        row |= zip(names, state.ravel().tolist(), strict=True)
+        row: dict[str, Any] = {"case": index, "level": trajectory.case.level}
+        row["time_s"] = round(step * DT_S, 1)
+        for who, (x_m, v_mps, a_mps2) in zip(VEHICLES, state.tolist(), strict=False):
+            row |= {f"x_{who}_m": x_m, f"v_{who}_mps": v_mps, f"a_{who}_mps2": a_mps2}
         if scenario.lane_m is not None:
             row[MERGED] = int(merged[step])
+        row |= starts | {"severity": run.outcome(index).measures.severity}
         for name, values in (trajectory.signals or {}).items():
             value = values[step]
             is_formula = isinstance(value, str) and value.startswith(FORMULA)
