@@ -7,7 +7,7 @@ from merge_sumo.analysis.counterfactuals import AVOIDANCE
 from merge_sumo.analysis.explanation import EXPLANATIONS
 from merge_sumo.analysis.stress import STRESS
 from merge_sumo.analysis.surface import Surface, learn_surface
-from merge_sumo.campaigns.printed_commands import call, campaign_command, command
+from merge_sumo.campaigns.printed_commands import campaign_command
 from merge_sumo.campaigns.recorded import RecordedCampaign, failures, regions_of, spread_failures
 from merge_sumo.errors import UserError
 from merge_sumo.metrics.cause import Diagnosis, Kind, diagnose
@@ -58,7 +58,7 @@ class ReportModel:
         diagnoses: conduct of VUT and POV by index; lost motions have none.
         kinds: kind of each failure that has one, by its index.
         boxes: boxes of the pool where cases fail, by level.
-        explain: commands that explain the case `INDEX` and write the report.
+        explain: command that explains the case `INDEX`.
 
     Example:
         >>> model = ReportModel(ms.open_run("runs/latest").recorded, learns=False)
@@ -109,10 +109,6 @@ class ReportModel:
         for level in self.levels:
             self.boxes += failure_boxes(self.worst + self.near, level)
         self.explain = campaign_command("explain", run.folder, run.record, INDEX)
-        if self.explain.startswith("ms."):
-            self.explain += f"; {call('report', run.folder)}"
-        else:
-            self.explain += f" && {command('report', run.folder)}"
 
     def _choose_cases(self) -> None:
         """Choose the cases that are listed, and those that the page holds one by one."""
