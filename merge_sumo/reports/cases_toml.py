@@ -80,8 +80,7 @@ def watching(run: RecordedCampaign) -> list[Outcome]:
     """Return at most 40 outcomes of a campaign, those that detect changes of a controller.
 
     A quarter are the worst failures of regions. The others pass, if enough cases do: of each level
-    in turn the one of least margin, then the one of least clearance, both a radius from those
-    chosen before, then the farthest one.
+    in turn the one of least margin that is a radius from those chosen before, then the farthest.
 
     Args:
         run: the campaign; all of its outcomes if there are not more.
@@ -98,13 +97,13 @@ def watching(run: RecordedCampaign) -> list[Outcome]:
         known = to_unit((o.case for o in chosen if o.case.level == level), level, scenario)
         points = to_unit((one.case for one in left), level, scenario)
         away = cKDTree(known).query(points)[0]
-        if turn % 3 == 2:
+        if turn % 2 == 1:
             place = away.argmax()
         else:
-            values = [(one.margin, one.measures.clearance_m)[turn % 3] for one in left]
             is_near = away <= radius_for(points.shape[1])
-            # The last key decides first; a missing clearance is the largest.
-            place = np.lexsort((np.array(values, dtype=float), is_near))[0]
+            margins = np.array([one.margin for one in left], dtype=float)
+            # The last key decides first.
+            place = np.lexsort((margins, is_near))[0]
         chosen.append(left[place])
     return [*chosen, *failing[MOST // 4 :]][:MOST]
 
