@@ -248,12 +248,6 @@ def _motion(run: RecordedCampaign, undecided: frozenset[int], failing: str) -> F
     if avoidable := _values(decided, "avoidable"):
         name = "failures that full braking or full acceleration of the VUT avoids"
         yield Fact(name, sum(avoidable), f"{failing}, avoidable")
-    for name, key, unit in (
-        ("hardest braking of the POV over 1.6 s in a failure", "pov_sustained_brake_mps2", "m/s²"),
-        ("largest loss of speed of the POV in a failure", "pov_slowdown_mps", "m/s"),
-    ):
-        if values := _values(decided, key):
-            yield Fact(name, max(values), f"{failing}: {key}", unit)
 
 
 def _avoided(run: RecordedCampaign, undecided: frozenset[int]) -> Facts:
