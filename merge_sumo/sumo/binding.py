@@ -83,8 +83,8 @@ def load_libsumo() -> Any:
 
 def _library_missing(name: str, reason: str) -> UserError:
     return UserError(
-        f"{name} cannot be loaded ({reason}): install libsumo=={SUMO_VERSION} and "
-        f"eclipse-sumo=={SUMO_VERSION} again, and on Debian or Ubuntu run "
+        f"{name} cannot be loaded ({reason}): run `pip install libsumo=={SUMO_VERSION} "
+        f"eclipse-sumo=={SUMO_VERSION}`, and on Debian or Ubuntu "
         f"`apt-get update && apt-get install -y {DEBIAN_PACKAGES}` as root"
     )
 

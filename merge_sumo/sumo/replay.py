@@ -22,7 +22,6 @@ from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.records import convert, read_record, to_json
 from merge_sumo.result import Result
 from merge_sumo.road.finder import FARTHEST_M
-from merge_sumo.road.loader import road_of
 from merge_sumo.road.road import Road
 from merge_sumo.road.xml_input import RECORD_TAGS, parse_xml, read_xml
 from merge_sumo.scenario.case import FloatArray
@@ -40,7 +39,6 @@ from merge_sumo.sumo.replay_folder import (
     CASE,
     CONFIG,
     HOLD_STEPS,
-    HOSTED_NET,
     NET,
     RECORD,
     SCENARIO,
@@ -194,9 +192,8 @@ def _read(folder: Path) -> _Episode:
             f"{folder} is not a replay folder: it has no {CASE}; name a replay folder, or a "
             "campaign and a case"
         )
-    net = HOSTED_NET if (folder / HOSTED_NET).exists() else NET
-    outcome = _outcome(folder / CASE)
-    road = _road(folder / net, outcome)
+    outcome, net = _outcome(folder / CASE), folder / NET
+    road = road_of_hosted(read_xml(net, "the net"), net, outcome.case.scenario.lane_m)
     name, cars = f"the record {folder / RECORD}", outcome.case.scenario.vehicles
     record, lanes = _record(folder / RECORD, name)
     record = record[: len(lanes) // cars, :cars]
@@ -220,21 +217,10 @@ def _read(folder: Path) -> _Episode:
 def _outcome(path: Path) -> Outcome:
     record: Any = read_record(path, dict[str, Any])
     try:
-        # Folders of older versions have none: they are of the paper's, which is the default.
-        scenario = convert(record.pop(SCENARIO, {}), Scenario)
+        scenario = convert(record.pop(SCENARIO, None), Scenario)
         return Outcome.from_json(to_json(record), scenario)
     except UserError as error:
         raise UserError(f"{path} is not the case of a replay: {error}") from error
-
-
-def _road(path: Path, outcome: Outcome) -> Road:
-    content = read_xml(path, "the net")
-    if path.name == HOSTED_NET:
-        return road_of_hosted(content, path, outcome.case.scenario.lane_m)
-    shipped = road_of()
-    if content != shipped.path.read_bytes():
-        raise UserError(f"{path} is not the net of this version: export the case again")
-    return shipped
 
 
 def _record(path: Path, name: str) -> tuple[FloatArray, dict[tuple[int, int], str]]:

@@ -1,7 +1,7 @@
 """Write an episode as a folder that sumo and sumo-gui play without merge-sumo.
 
-`write_replay_folder` writes all files. On the road of us23 the folder has the shipped net. On
-another road it has a net of the two paths alone, without speed limits (`net_copies`).
+`write_replay_folder` writes all files. The net of the folder has the two paths of the road alone,
+without speed limits (`net_copies`).
 """
 
 from __future__ import annotations
@@ -9,7 +9,6 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence, Set
 from dataclasses import dataclass, replace
-from operator import attrgetter
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +20,6 @@ from merge_sumo.metrics.merge import merged_rows
 from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.records import to_json
 from merge_sumo.road.finder import find_road, read_net
-from merge_sumo.road.loader import road_of
 from merge_sumo.road.road import LanePath, Road
 from merge_sumo.road.xml_input import to_bytes
 from merge_sumo.scenario.case import Case, FloatArray, described
@@ -31,10 +29,8 @@ from merge_sumo.sumo.net_copies import COPY, LANE, hosted_net
 
 CONFIG = "replay.sumocfg"
 """The file that sumo and sumo-gui open."""
-NET = "us23.net.xml"
-"""Net of the paper's scenario."""
-HOSTED_NET = "road.net.xml"
-"""Net of any other road."""
+NET = "road.net.xml"
+"""The net, which `hosted_net` writes."""
 LANE_EDGE = LANE.replace(COPY, ".0")
 """Edge of that net with an acceleration lane and the mainline next to it."""
 TYPES = "vehicles.add.xml"
@@ -132,13 +128,9 @@ def write_replay_folder(folder: Path, road: Road, outcome: Outcome, trajectory: 
 
 def _road_of_folder(road: Road, folder: Path) -> Road:
     """Return a road with the lanes of the net of a folder."""
-    shipped = road_of()
-    identity = attrgetter("sha256", "mainline_edges", "ramp_edges")
-    if identity(road) == identity(shipped):
-        return shipped
     mainline, ramp = _without_limit(road.mainline), _without_limit(road.ramp)
     net = hosted_net(replace(road, mainline=mainline, ramp=ramp), 1, lane_goes_on=True)
-    return road_of_hosted(net, folder / HOSTED_NET, road.lane_m)
+    return road_of_hosted(net, folder / NET, road.lane_m)
 
 
 def _without_limit(path: LanePath) -> LanePath:
@@ -201,20 +193,16 @@ def files_of(
     Returns:
         The contents by name, the configuration last.
     """
-    shipped = road_of()
-    if road == shipped:
-        file, net = NET, shipped.path.read_bytes()
-    else:
-        file, net = HOSTED_NET, hosted_net(road, 1, lane_goes_on=True)
     view = _view_of(road, record)
     roots = {
         TYPES: _types(trajectory),
         LABELS: _labels(outcome, trajectory, view),
         RECORD: record,
         VIEW: view_settings(view),
-        CONFIG: _config(file, len(record)),
+        CONFIG: _config(len(record)),
     }
-    return {file: net} | {name: to_bytes(root) for name, root in roots.items()}
+    net = hosted_net(road, 1, lane_goes_on=True)
+    return {NET: net} | {name: to_bytes(root) for name, root in roots.items()}
 
 
 def _types(trajectory: Trajectory) -> etree._Element:
@@ -314,10 +302,10 @@ def _box(points: Sequence[tuple[float, float]]) -> tuple[float, FloatArray]:
     return max(width_m, height_m / (0.8 * SHAPE)), (low + high) / 2.0
 
 
-def _config(net_file: str, timesteps: int) -> etree._Element:
+def _config(timesteps: int) -> etree._Element:
     end_s = timesteps * DT_S
     options = {
-        "net-file": net_file,
+        "net-file": NET,
         "additional-files": f"{TYPES},{LABELS}",
         "begin": "0",
         "end": f"{end_s:.1f}",

@@ -26,12 +26,12 @@ from merge_sumo.errors import UserError
 from merge_sumo.road import xml_input
 from merge_sumo.road.loader import default_net_path, road_of
 from merge_sumo.scenario.scenario import US23
-from merge_sumo.sumo import mirror
+from merge_sumo.sumo import mirror, replay_folder
 from merge_sumo.sumo import replay as replay_module
 from merge_sumo.sumo.binding import run_program
 from merge_sumo.sumo.opendrive import opendrive
 from merge_sumo.sumo.replay import replay
-from merge_sumo.sumo.replay_folder import CONFIG, HOSTED_NET, RECORD
+from merge_sumo.sumo.replay_folder import CONFIG, RECORD
 from merge_sumo.sumo.sumo_simulation import SumoSimulation
 
 HONEST = Path(__file__).resolve().parents[2] / "scenarios" / "roundabout-yields"
@@ -143,7 +143,7 @@ ATTACKS = {
     # Not the file that it seems.
     "long name": (SETTINGS, instead("design1", "<script>" * 10**6), export, "at most 10,000"),
     "pipe of outcomes": (OUTCOMES, pipe, export, "it is not a file"),
-    "terabyte": (HOSTED_NET, of_a_terabyte, play, "it is larger than"),
+    "terabyte": (replay_folder.NET, of_a_terabyte, play, "it is larger than"),
     "link to a secret": (RECORD, link, play, "must have"),
     # The cache of truths.
     "truth": (TRUTH, truth(), believe, "believed"),
