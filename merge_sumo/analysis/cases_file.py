@@ -12,7 +12,7 @@ from msgspec import Meta
 
 from merge_sumo.analysis.comparison import Change, ComparedCase
 from merge_sumo.campaigns.recorded import RecordedCampaign
-from merge_sumo.errors import UserError
+from merge_sumo.errors import UserError, explained
 from merge_sumo.metrics.criterion import PAPER_CRITERION, Criterion
 from merge_sumo.metrics.measures import Measures, measures_in
 from merge_sumo.metrics.merge import Severity
@@ -65,8 +65,7 @@ class CasesFile(RecordedCampaign):
 
     def __init__(self, path: Path) -> None:
         _, record = read_toml(path, "cases file")
-        at = ""
-        try:
+        with explained(f"the cases file {path}"):
             head = convert(record, Head)
             scenario = convert(head.scenario, Scenario)
             if scenario.net is not None and "/" in scenario.net:
@@ -79,10 +78,8 @@ class CasesFile(RecordedCampaign):
             self._by_index: dict[int, Outcome] = {}
             self.accepted: dict[int, str] = {}
             for line in head.cases:
-                at = f"case {line.get('index')!r:.40}: "
-                self._add(line)
-        except UserError as error:
-            raise UserError(f"the cases file {path}: {at}{error}") from error
+                with explained(f"case {line.get('index')!r:.40}"):
+                    self._add(line)
         self.outcomes = list(self._by_index.values())
         self.record["levels"] = self.levels
 

@@ -10,7 +10,7 @@ from merge_sumo.controllers.spec import ControllerKind
 from merge_sumo.drivers import __name__ as room
 from merge_sumo.drivers import __path__ as folders
 from merge_sumo.drivers.base import BuiltInVut, Driver
-from merge_sumo.errors import UserError
+from merge_sumo.errors import explained
 
 
 def found() -> dict[str, BuiltInVut]:
@@ -44,10 +44,8 @@ class BuiltInKind(ControllerKind):
                 raise spec.unknown_parameter(name, settable)
             settable[name] = float(value)
         if self._design is not None:
-            try:
+            with explained(str(spec)):
                 self._design = replace(self._design, **settable)
-            except UserError as error:
-                raise UserError(f"{spec}: {error}") from error
         if built_in.ramp_only:
             self.no_pov = "that is a VUT for the ramp; the POVs of levels 0 to 2 need no name"
 

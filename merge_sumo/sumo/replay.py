@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from merge_sumo.errors import UserError, notice
+from merge_sumo.errors import UserError, explained, notice
 from merge_sumo.interrupt import stopping_in_order
 from merge_sumo.metrics.cause import cause
 from merge_sumo.metrics.merge import Conflict
@@ -216,11 +216,9 @@ def _read(folder: Path) -> _Episode:
 
 def _outcome(path: Path) -> Outcome:
     record: Any = read_record(path, dict[str, Any])
-    try:
+    with explained(f"{path} is not the case of a replay"):
         scenario = convert(record.pop(SCENARIO, None), Scenario)
         return Outcome.from_json(to_json(record), scenario)
-    except UserError as error:
-        raise UserError(f"{path} is not the case of a replay: {error}") from error
 
 
 def _record(path: Path, name: str) -> tuple[FloatArray, dict[tuple[int, int], str]]:
