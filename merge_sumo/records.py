@@ -39,7 +39,6 @@ from numpy.typing import NDArray
 
 from merge_sumo.errors import UserError, explained
 from merge_sumo.files import read_limited, regular
-from merge_sumo.printable import meant
 
 T = TypeVar("T")
 
@@ -320,9 +319,7 @@ def _hints(kind: type) -> dict[str, Any]:
 
 
 def _unknown(name: object, kind: Any) -> str:
-    known = list(_hints(kind))
-    hint = meant(str(name), known) or f"it has {', '.join(known)}"
-    return f"{kind.__name__.lower()} has no {name!r:.60}: {hint.strip()}"
+    return f"{kind.__name__.lower()} has no {name!r:.60}: it has {', '.join(_hints(kind))}"
 
 
 def _sentence(error: msgspec.ValidationError, record: Any, kind: Any) -> str:

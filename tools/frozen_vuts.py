@@ -16,7 +16,6 @@ from merge_sumo.controllers.kinds import KINDS
 from merge_sumo.controllers.spec import ControllerKind, ControllerOptions, ControllerSpec
 from merge_sumo.drivers.base import Driver, Scene
 from merge_sumo.errors import UserError
-from merge_sumo.printable import meant
 from merge_sumo.scenario.case import Case, FloatArray
 from merge_sumo.scenario.scenario import DT_S
 
@@ -157,7 +156,7 @@ class FrozenKind(ControllerKind):
         """Find the VUT; `UserError` for another name."""
         super().__init__(spec, options)
         if spec.argument not in FROZEN_VUTS:
-            raise UserError(f"unknown VUT {spec}: {meant(spec.argument, FROZEN_VUTS)}")
+            raise UserError(f"unknown VUT {spec}: choose one of {', '.join(FROZEN_VUTS)}")
 
     def driver(self, corridors: int, _simulation: object) -> Driver:
         """Return its driver."""

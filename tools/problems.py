@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.errors import UserError
 from merge_sumo.files import sha256_of
-from merge_sumo.printable import meant
 from merge_sumo.records import Record, read_arrays, read_record
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.scenario.case import FloatArray, Pool
@@ -181,10 +180,7 @@ def named_problems(names: Iterable[str]) -> tuple[Problem, ...]:
     once = dict.fromkeys(names)
     for name in once:
         if name not in known:
-            raise UserError(
-                f"--problems: unknown problem {name!r}: {meant(name, known)}choose from "
-                f"{', '.join(known)}"
-            )
+            raise UserError(f"--problems: unknown problem {name!r}: choose from {', '.join(known)}")
     return tuple(known[name] for name in once)
 
 

@@ -23,8 +23,7 @@ from typing import Annotated, Any
 import numpy as np
 from msgspec import Meta
 
-from merge_sumo.errors import UserError
-from merge_sumo.printable import meant
+from merge_sumo.errors import UserError, explained
 from merge_sumo.records import Record, convert, decode, read_toml, record_type, to_plain
 from merge_sumo.scenario.case import FloatArray
 from merge_sumo.scenario.scenario import Coordinate, Scenario
@@ -235,8 +234,11 @@ def read_distribution(
     even = dict.fromkeys(map(str, levels), 1.0)
     kind = record_type("distribution", [("levels", ByLevel, {}), *fields])
     marginals = {}
-    try:
-        content = kind() if path is None else decode(Path(path).read_bytes(), kind)
+    with explained(str(path)):
+        try:
+            content = kind() if path is None else decode(Path(path).read_bytes(), kind)
+        except OSError as error:
+            raise UserError(f"it cannot be read ({error.strerror})") from error
         for d in coordinates:
             marginals[d.field] = getattr(content, d.field)
             marginals[d.field].cut(d)  # which raises for a wrong one
@@ -247,10 +249,6 @@ def read_distribution(
         total = sum(weights.values())
         if total == 0.0:
             raise UserError("levels must have weights that are not all 0")
-    except OSError as error:
-        raise UserError(f"cannot read {path}: {error.strerror}") from error
-    except UserError as error:
-        raise UserError(f"{path}: {error}") from error
     shares = {int(level): weight / total for level, weight in weights.items() if weight > 0.0}
     return Distribution(shares, marginals, scenario)
 
@@ -341,13 +339,10 @@ def named_traffic(name: str) -> Traffic:
     path = shipped.get(name, Path(name))
     if path.suffix != SUFFIX:
         raise UserError(
-            f"there is no traffic {name!r}: {meant(name, list(shipped))}choose "
-            f"{', '.join(shipped)}, or a file NAME{SUFFIX}"
+            f"there is no traffic {name!r}: choose {', '.join(shipped)}, or a file NAME{SUFFIX}"
         )
     _, record = read_toml(path, "traffic")
-    try:
+    with explained(str(path)):
         traffic = convert({"name": path.stem, **record}, Traffic)
         traffic.speeds.law(0.0, 1.0)
-    except UserError as error:
-        raise UserError(f"{path}: {error}") from error
     return traffic

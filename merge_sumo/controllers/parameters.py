@@ -8,7 +8,6 @@ from dataclasses import dataclass
 
 from merge_sumo.controllers.spec import ControllerKind
 from merge_sumo.errors import UserError
-from merge_sumo.printable import meant
 
 DIGITS = 3
 """Digits of a rounded value relative to its range: 0.5..3 is rounded to thousandths."""
@@ -77,8 +76,7 @@ def values_of(controller: ControllerKind, ranges: Sequence[Range]) -> dict[str, 
                 f"{name}=VALUE"
             )
         if name not in known:
-            hint = meant(name, known)
-            choice = f"{hint}choose from {', '.join(sorted(known))}" if known else "it has none"
+            choice = f"choose from {', '.join(sorted(known))}" if known else "it has none"
             raise UserError(f"`params` {name}: {controller.spec} has no such parameter: {choice}")
         if not each.low <= known[name] <= each.high:
             raise UserError(

@@ -16,7 +16,7 @@ import numpy as np
 
 from merge_sumo.errors import UserError
 from merge_sumo.metrics.expression import LEAST_MARGIN, MOST_CHARACTERS, MOST_MARGIN
-from merge_sumo.printable import meant, printable
+from merge_sumo.printable import printable
 from merge_sumo.scenario.case import FloatArray
 from merge_sumo.scenario.scenario import DT_S, MAX_EPISODE_S, MAX_FOLLOW_UP_S, VUT
 from merge_sumo.scenario.trajectory import Trajectory
@@ -79,11 +79,9 @@ def check_formula(text: str) -> str:
     if unknown := _TOKEN.sub("", text):
         sign = printable(unknown[0])
         raise UserError(f"{what}: {sign!r} is not part of a formula over signals")
-    known = (*SIGNALS, *WORDS)
     for word in _WORD.findall(text):
-        if word not in known:
-            hint = meant(word, known) or f"choose {', '.join(SIGNALS)}"
-            raise UserError(f"{what}: no signal {word!r}: {hint.strip()}")
+        if word not in (*SIGNALS, *WORDS):
+            raise UserError(f"{what}: no signal {word!r}: choose {', '.join(SIGNALS)}")
     depth = 0
     for sign in text:
         depth += (sign == "(") - (sign == ")")

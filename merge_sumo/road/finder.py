@@ -19,8 +19,7 @@ from typing import Any, NamedTuple
 
 from lxml import etree
 
-from merge_sumo.errors import UserError
-from merge_sumo.printable import meant
+from merge_sumo.errors import UserError, explained
 from merge_sumo.road.road import (
     AccelerationLane,
     Approach,
@@ -162,9 +161,8 @@ def find_road(
     """
     edges = tuple(mainline), tuple(ramp)
     try:
-        return _road(road_net, edges, edge_at_m, room_after_m, lane_m)
-    except UserError as error:
-        raise UserError(f"the net {road_net.path} cannot host a merge: {error}") from error
+        with explained(f"the net {road_net.path} cannot host a merge"):
+            return _road(road_net, edges, edge_at_m, room_after_m, lane_m)
     except INVALID as error:
         raise UserError(f"{road_net.path} is not a valid SUMO net ({error!r:.200})") from error
 
@@ -272,8 +270,7 @@ def _check_edge(road_net: RoadNet, name: str) -> None:
     """Raise `UserError` where a net has no such edge, or cars may not drive there."""
     net = road_net.net
     if not net.hasEdge(name) or net.getEdge(name).isSpecial():
-        hint = meant(name, road_net.edges, 0.5)  # ids of edges are short
-        raise UserError(f"it has no edge {name}: {hint}name edges of the net")
+        raise UserError(f"it has no edge {name}: name edges of the net")
     if not _lanes(net, name):
         raise UserError(f"no lane of edge {name} is open to cars")
 

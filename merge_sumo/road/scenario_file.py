@@ -17,7 +17,6 @@ from pathlib import Path
 
 from merge_sumo.errors import UserError
 from merge_sumo.files import resource
-from merge_sumo.printable import meant
 from merge_sumo.records import convert, read_toml, toml_value
 from merge_sumo.scenario.scenario import US23, Scenario
 
@@ -54,8 +53,7 @@ def named_scenario(name: str) -> Scenario:
         return _read(resource("sumo_net") / f"{name}{SUFFIX}")
     if not name.endswith(SUFFIX):
         raise UserError(
-            f"there is no scenario {name!r}: {meant(name, known)}choose {', '.join(known)}, or a "
-            f"file NAME{SUFFIX}"
+            f"there is no scenario {name!r}: choose {', '.join(known)}, or a file NAME{SUFFIX}"
         )
     scenario = _read(Path(name))
     if scenario.net is None:

@@ -276,7 +276,7 @@ def test_a_net_of_the_user_is_found_from_the_file(tmp_path):
     [
         ('vut = "design2"', "vut = 2", "vut is 2: it must be a text"),
         ("tolerance = 0.01", "tolerance = nan", "tolerance is nan"),
-        ("tolerance = 0.01", "tolerence = 0.01", "has no 'tolerence': did you mean tolerance?"),
+        ("tolerance = 0.01", "tolerence = 0.01", "has no 'tolerence': it has vut, "),
         ('scenario = {name = "us23"}', 'scenario = "us99"', "scenario is 'us99': it must be a"),
         ('fail_when = "paper"', 'fail_when = "scores < 3"', "no measure 'scores'"),
         ("x_pov0_m = -", "x_pov0_m = -500.5, dx_m = -", "is outside of the pool, -340 to -180 m"),

@@ -165,7 +165,7 @@ class TestSettings:
     @pytest.mark.parametrize(
         ("text", "said"),
         [
-            ("delay=1", "`sense`: sensing has no 'delay': did you mean delay_s?"),
+            ("delay=1", "`sense`: sensing has no 'delay': it has "),
             ("delay_s=x", "`sense`: delay_s is 'x': it must be a number or two numbers"),
             ("delay_s=9", "`sense`: delay_s is 9: choose 0 to 5"),
             ("delay_s=0.5..0.2", "`sense`: delay_s is 0.5..0.2: the first number of a range must"),

@@ -55,7 +55,7 @@ WRONG = [
     ({"range_m": [1, 2, 3]}, "two numbers, [low, high] or a number"),
     ({"edges": "a b"}, "edges is 'a b': it must be a list of texts"),
     ({"side": "up"}, "side is 'up': it must be one of left, right"),
-    ({"spede_mps": 1}, "car has no 'spede_mps': did you mean speed_mps?"),
+    ({"spede_mps": 1}, "car has no 'spede_mps': it has index, speed_mps"),
 ]
 
 
