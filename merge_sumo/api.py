@@ -269,7 +269,6 @@ def _written(
         if compared.text is not None:
             check_toml_size(content, out)
         write_new(out, content)
-        compared = replace(compared, page_command="")
     if junit is not None:
         write_junit_of_comparison(junit, compared)
     return compared

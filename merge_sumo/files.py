@@ -20,7 +20,6 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from datetime import datetime
 from functools import lru_cache
-from itertools import count
 from pathlib import Path
 from typing import BinaryIO
 
@@ -292,18 +291,6 @@ def sync_folder(folder: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
-
-
-def free(path: Path) -> Path:
-    """Return a path, with a number at the end of its stem where something is there.
-
-    Args:
-        path: the path.
-    """
-    candidate, number = path, count(2)
-    while os.path.lexists(candidate):
-        candidate = path.with_stem(f"{path.stem}-{next(number)}")
-    return candidate
 
 
 def dated(what: str) -> Path:

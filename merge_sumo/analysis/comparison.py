@@ -11,14 +11,11 @@ from dataclasses import dataclass, replace
 from enum import StrEnum
 from functools import cached_property
 from itertools import pairwise
-from pathlib import Path
 from typing import Any
 
-from merge_sumo.campaigns.printed_commands import command
 from merge_sumo.campaigns.recorded import RecordedCampaign
 from merge_sumo.campaigns.settings import same_pov
 from merge_sumo.errors import UserError
-from merge_sumo.files import free
 from merge_sumo.metrics.merge import Severity
 from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.metrics.summary import (
@@ -37,8 +34,6 @@ LISTED = 10
 """Maximum number of cases of each kind that lines name."""
 SIGNIFICANT = 0.05
 """Largest p-value of Fisher's exact test at which a difference is more than chance."""
-PAGE = Path("changes.html")
-"""The page with both motions that a command writes."""
 
 
 @dataclass(frozen=True)
@@ -292,7 +287,6 @@ class Comparison(Result):
         version_changes: the changes, one for each version but the first.
         source: a sentence on the origin of the cases.
         notes: sentences on the limits of the comparison.
-        page_command: the command that writes its page, with both motions of the cases.
         text: the new text of a cases file, whose changed lines are in the notes; None otherwise.
     """
 
@@ -300,7 +294,6 @@ class Comparison(Result):
     version_changes: tuple[VersionChange, ...]
     source: str
     notes: tuple[str, ...] = ()
-    page_command: str = ""
     text: str | None = None
 
     @property
@@ -371,7 +364,6 @@ def compare(runs: Sequence[RecordedCampaign]) -> Comparison:
             "one with another VUT"
         ),
         notes=tuple(notes),
-        page_command=command("compare", *(run.folder for run in runs), out=free(PAGE)),
     )
 
 

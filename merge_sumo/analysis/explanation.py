@@ -115,17 +115,6 @@ class Explanation(Record, frozen=True):
         """The case and the VUT: a file has one explanation for each such pair."""
         return self.index, self.vut or ""
 
-    @property
-    def nearest_start(self) -> tuple[str, float] | None:
-        """Coordinate and value of the smallest change, as a share of the pool; None without any."""
-        nearest, least = None, math.inf
-        for axis in self.start:
-            for value in axis.passing:
-                share = abs(value - axis.value) / (axis.high - axis.low)
-                if share < least:
-                    least, nearest = share, (axis.name, value)
-        return nearest
-
 
 EXPLANATIONS = StudyFile("explanations.jsonl", Explanation)
 """A line for each failure and VUT that was explained."""

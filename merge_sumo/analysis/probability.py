@@ -290,7 +290,7 @@ def expected_cells(study: RunStudy, distribution: Distribution) -> list[Cells]:
         expects = np.zeros(shape, dtype=bool)
         if surface is not None:
             middle = (np.indices(shape).reshape(len(shape), -1).T + 0.5) / shape
-            chance = surface.chance(distribution.points(level, middle))
+            chance = surface(distribution.points(level, middle))
             expects = maximum_filter((chance >= EXPECTED).reshape(shape), 3)
         for expects_failures in (False, True):
             numbers = np.flatnonzero(expects == expects_failures)

@@ -7,8 +7,6 @@ from dataclasses import replace
 
 from merge_sumo.analysis.cases_file import CasesFile
 from merge_sumo.analysis.comparison import (
-    LISTED,
-    PAGE,
     Change,
     ComparedCase,
     Comparison,
@@ -18,7 +16,6 @@ from merge_sumo.analysis.comparison import (
     with_shares,
 )
 from merge_sumo.analysis.run_study import RunStudy
-from merge_sumo.campaigns.printed_commands import command
 from merge_sumo.campaigns.recorded import RecordedCampaign
 from merge_sumo.campaigns.repeatability import (
     SecondRun,
@@ -27,7 +24,6 @@ from merge_sumo.campaigns.repeatability import (
     unrepeatable,
 )
 from merge_sumo.errors import UserError
-from merge_sumo.files import free
 from merge_sumo.metrics.outcome import Episode, Outcome
 from merge_sumo.printable import counted
 from merge_sumo.scenario.scenario import AnyLevels, level_name, names_of_levels
@@ -116,11 +112,7 @@ def rerun(study: RunStudy, recorded: Sequence[Outcome]) -> Comparison:
             "random numbers from the seed of the case, as `reset(seen, seed)` tells it in Python, "
             "or compare campaigns of both versions with `repeat`"
         )
-    differing = [one.later.index for one in version_change.cases if one.change is not Change.BOTH]
-    drivers = {"vut": settings.vut, "pov": settings.pov}
-    page = command("rerun", run.folder, differing[:LISTED], **drivers, out=free(PAGE))
-    changes = (version_change,)
-    return replace(compared, version_changes=changes, notes=tuple(notes), page_command=page)
+    return replace(compared, version_changes=(version_change,), notes=tuple(notes))
 
 
 def _repeated(

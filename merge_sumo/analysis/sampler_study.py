@@ -219,7 +219,8 @@ class Study:
         truths, dense = {}, {}
         for level in levels:
             truths[level] = self.truth(level, options.truth_cases)
-            truth = known_truth(self.plan, level, DENSE_CASES, cache=self.cache)
+            plan = self.plan.at_level(level).with_engine(self.engine)
+            truth = known_truth(plan, level, DENSE_CASES, cache=self.cache)
             if truth is not None:
                 dense[level] = truth
         return SamplerStudy(self.searches(levels, samplers, options), truths, dense)

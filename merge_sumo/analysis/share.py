@@ -28,10 +28,8 @@ from merge_sumo.workers import Workers
 
 CASES = 2000
 """Uniform cases of a level: 0 failures among them are less than .15 % of all starts."""
-LEAST = 200
-"""Minimum number of uniform cases of a level where they run in SUMO."""
-PART = 0.2
-"""Their number as a share of the cases of the campaign, where that is more."""
+CASES_IN_SUMO = 200
+"""Uniform cases of a level where they run in SUMO."""
 CONFIDENCE = 0.95
 STREAM = 11
 """Key of the random stream, which no sampler uses."""
@@ -129,8 +127,7 @@ def write_shares(
             SHARES.write(run.folder, Shares(tuple(own_shares(run))))
         return
     by_equations = plan.needs_sumo is None
-    part = round(PART * len(run.outcomes) / len(run.levels))
-    count = CASES if by_equations else max(LEAST, part)
+    count = CASES if by_equations else CASES_IN_SUMO
     plan = plan.for_verdicts().with_engine(None).with_log(run.folder.resolve() / LOG)
     shares: list[LevelShare] = []
     # Worker processes would take longer to start than the cases by the equations of motion.

@@ -99,18 +99,11 @@ class StressResult(Result, Record, frozen=True):
     @property
     def robust(self) -> tuple[int, ...]:
         """Indices of the failures that fail in every run of every rung, the worst first."""
-        return tuple(index for index in self.failures if not self.passes_in(index))
-
-    def passes_in(self, index: int) -> int:
-        """Return the number of runs, over all rungs, in which a failure does not fail.
-
-        Args:
-            index: index of the failure.
-        """
-        count = 0
+        fragile: set[int] = set()
         for rung in self.rungs:
-            count += sum(index in (*run.passes, *run.without_verdict) for run in rung.runs)
-        return count
+            for run in rung.runs:
+                fragile.update(run.passes, run.without_verdict)
+        return tuple(index for index in self.failures if index not in fragile)
 
     def share(self, rung: Rung) -> float:
         """Return the share of verdicts that flip on a rung.

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -26,31 +25,8 @@ PART = 4000
 Grid = tuple[int, int, int]
 """Nodes in each coordinate; of two coordinates the last number is 1."""
 
-
-@dataclass(frozen=True, slots=True)
-class Surface:
-    """The surrogate of one level of a campaign.
-
-    Example:
-        surface = learn_surface(run.outcomes, level=0)
-        chance = surface.chance(nodes((50, 50, 1)))
-
-    Attributes:
-        predict: returns the failure probability, (n,), at points, (n, d), of the unit cube.
-    """
-
-    predict: Callable[[FloatArray], FloatArray]
-
-    def chance(self, points: FloatArray) -> FloatArray:
-        """Return the failure probability of cases, (n,), computed on all cores.
-
-        Args:
-            points: points of the unit cube, (n, d).
-        """
-        parts = np.array_split(points, len(points) // PART + 1)
-        # Each part in one thread: the answer is the same whatever the number of cores.
-        with threadpool_limits(1), ThreadPoolExecutor(number_of_workers(None)) as cores:
-            return np.concatenate(list(cores.map(self.predict, parts)))
+Surface = Callable[[FloatArray], FloatArray]
+"""Returns the failure probability of cases, (n,), at points of the unit cube, (n, d)."""
 
 
 def nodes(grid: Grid) -> FloatArray:
@@ -69,13 +45,18 @@ def learn_surface(
 ) -> Surface | None:
     """Learn the surrogate of a level.
 
+    Example:
+        surface = learn_surface(run.outcomes, level=0)
+        chance = surface(nodes((50, 50, 1)))
+
     Args:
         outcomes: outcomes of a campaign.
         level: level of the POV.
         tolerated: share of its runs in which a case may fail, 0 to 1.
 
     Returns:
-        The surrogate; None where too few cases failed or passed to learn from.
+        The surrogate, which computes on all cores; None where too few cases failed or passed to
+        learn from.
     """
     at_level = [outcome for outcome in outcomes if outcome.case.level == level]
     if not at_level:
@@ -90,4 +71,11 @@ def learn_surface(
     with threadpool_limits(1):
         predict = learn_chance(history)
     assert predict is not None, "there are cases enough"  # noqa: S101
-    return Surface(predict)
+
+    def chance(points: FloatArray) -> FloatArray:
+        parts = np.array_split(points, len(points) // PART + 1)
+        # Each part in one thread: the answer is the same whatever the number of cores.
+        with threadpool_limits(1), ThreadPoolExecutor(number_of_workers(None)) as cores:
+            return np.concatenate(list(cores.map(predict, parts)))
+
+    return chance

@@ -6,8 +6,8 @@ import hashlib
 import io
 import json
 import stat
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import asdict, dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,6 @@ from merge_sumo.files import (
     check_own,
     check_private,
     make_folder,
-    regular,
     replace_own,
     sha256_of,
 )
@@ -31,7 +30,7 @@ from merge_sumo.metrics.outcome import Episode
 from merge_sumo.records import decode, read_arrays
 from merge_sumo.result import Result
 from merge_sumo.scenario.case import FloatArray, Pool
-from merge_sumo.scenario.scenario import OWN, Scenario, level_name
+from merge_sumo.scenario.scenario import OWN, Scenario
 from merge_sumo.simulation.evaluate import evaluate
 from merge_sumo.simulation.plan import Engine, SimulationPlan
 from merge_sumo.workers import Workers
@@ -40,8 +39,6 @@ TRUTH_CASES = {0: 10_000, 1: 10_000, 2: 20_000, OWN: 10_000}
 """Uniform cases of the ground truth at each level, as in the paper."""
 DENSE_CASES = 1_000_000
 """Uniform cases of a dense truth, which shows most failures that the paper's number has missed."""
-MOST_FILES_BYTES = 1 << 26
-"""Maximum size of the names and hashes of files in a truth, in bytes."""
 REAL_REGION = 0.03
 """A region of the truth counts when it holds at least this share of its failures."""
 MOST_GROWTH = 0.2
@@ -134,10 +131,10 @@ def ground_truth(
         UserError: where nothing can be kept in the cache, or others can write it.
     """
     plan = plan.for_verdicts()
-    known = known_truth(plan, level, cases, seed, cache=cache, engines=(Engine.SUMO, plan.engine))
+    known = known_truth(plan, level, cases, seed, cache=cache)
     if known is not None:
         return known
-    path = TruthKey(plan.key(level), level, cases, seed, plan.engine).path(cache)
+    path = truth_path(plan, level, cases, seed, cache=cache)
     if not path.parent.is_dir():
         make_folder(path.parent, CACHE)
         path.parent.chmod(stat.S_IRWXU)
@@ -161,15 +158,9 @@ def ground_truth(
 
 
 def known_truth(
-    plan: SimulationPlan,
-    level: int,
-    cases: int,
-    seed: int = 0,
-    *,
-    cache: Path | None = None,
-    engines: Iterable[Engine] = tuple(Engine),
+    plan: SimulationPlan, level: int, cases: int, seed: int = 0, *, cache: Path | None = None
 ) -> Truth | None:
-    """Return a truth from the cache.
+    """Return a truth from the cache: one by SUMO, or else by the engine of the plan.
 
     Args:
         plan: how the cases would run.
@@ -177,73 +168,60 @@ def known_truth(
         cases: number of cases.
         seed: seed of the cases.
         cache: folder of the truths; None for that of the user.
-        engines: engines, the preferred one first.
 
     Returns:
-        The truth; None where the cache has none by these engines.
+        The truth; None where the cache has none.
     """
-    plan = plan.for_verdicts()
-    for engine in engines:
-        truth = TruthKey(plan.key(level), level, cases, seed, engine).read(plan.scenario, cache)
+    shape = cases, len(plan.scenario.dimensions(level))
+    for engine in (Engine.SUMO, plan.engine):
+        path = truth_path(replace(plan, engine=engine), level, cases, seed, cache=cache)
+        truth = _read(path, shape)
         if truth is not None:
             return truth
     return None
 
 
-@dataclass(frozen=True, slots=True)
-class TruthKey:
-    """The key of a truth in the cache.
+def truth_path(
+    plan: SimulationPlan, level: int, cases: int, seed: int = 0, *, cache: Path | None = None
+) -> Path:
+    """Return the file of a truth in the cache: its name is a hash of all that decides it.
 
-    Attributes:
-        plan: all that decides the outcomes: `SimulationPlan.key` for the level.
+    Args:
+        plan: how the cases run, with the engine that moves the vehicles.
         level: level of the POV.
         cases: number of cases.
         seed: seed of their points.
-        engine: the engine that moved the vehicles.
+        cache: folder of the truths; None for that of the user.
     """
+    record = {
+        "plan": plan.for_verdicts().key(level),
+        "level": level,
+        "cases": cases,
+        "seed": seed,
+        "engine": plan.engine,
+    }
+    key = hashlib.sha256(json.dumps(record, sort_keys=True).encode()).hexdigest()[:24]
+    return (cache or cache_folder()) / f"truth-{key}.npz"
 
-    plan: Mapping[str, Any]
-    level: int
-    cases: int
-    seed: int
-    engine: Engine = Engine.SUMO
 
-    def path(self, cache: Path | None = None) -> Path:
-        """Return the file of the truth in the cache.
+def _read(path: Path, shape: tuple[int, int]) -> Truth | None:
+    """Read a truth with points of a shape, (n, d).
 
-        Args:
-            cache: folder of the truths; None for that of the user.
-        """
-        key = hashlib.sha256(json.dumps(asdict(self), sort_keys=True).encode()).hexdigest()[:24]
-        return (cache or cache_folder()) / f"truth-{key}.npz"
-
-    def read(self, scenario: Scenario, cache: Path | None = None) -> Truth | None:
-        """Read the truth from the cache.
-
-        Args:
-            scenario: scenario of the cases.
-            cache: folder of the truths; None for that of the user.
-
-        Returns:
-            The truth; None where the file is missing or torn, has other shapes or belongs to
-            another key, where others can write the cache, and where a file that the VUT loaded has
-            changed.
-        """
-        path, dims = self.path(cache), len(scenario.dimensions(self.level))
-        try:
-            check_private(path.parent)
-            if regular(path).stat().st_size > 8 * self.cases * (dims + 1) + MOST_FILES_BYTES:
-                return None
-            data = read_arrays(path, "points", "margin", "in_sumo", "files", "of")
-            files = decode(str(data["files"]), dict[str, str | None])
-            unchanged = all(sha256_of(Path(name)) == sha256 for name, sha256 in files.items())
-        except (OSError, UserError):
-            return None
-        points, margin = data["points"], data["margin"]
-        has_shapes = points.shape == (self.cases, dims) and margin.shape == (self.cases,)
-        if not (unchanged and has_shapes and str(data["of"]) == path.stem):
-            return None
-        return Truth(points, margin, int(data["in_sumo"]))
+    It is None where the file is missing or torn, has other shapes or belongs to another key, where
+    others can write the cache, and where a file that the VUT loaded has changed.
+    """
+    try:
+        check_private(path.parent)
+        data = read_arrays(path, "points", "margin", "in_sumo", "files", "of")
+        files = decode(str(data["files"]), dict[str, str | None])
+        unchanged = all(sha256_of(Path(name)) == sha256 for name, sha256 in files.items())
+    except (OSError, UserError):
+        return None
+    points, margin = data["points"], data["margin"]
+    has_shapes = points.shape == shape and margin.shape == shape[:1]
+    if not (unchanged and has_shapes and str(data["of"]) == path.stem):
+        return None
+    return Truth(points, margin, int(data["in_sumo"]))
 
 
 def _margin_of(episode: Episode) -> tuple[float, bool, Files]:
@@ -274,13 +252,6 @@ class TruthResult(Result):
     scenario: Scenario
 
     def to_record(self) -> dict[str, Any]:
-        """Return what `--json` prints: the record of the level, or sums and a list of levels."""
-        same = {"vut": self.vut, "fail_when": self.criterion.as_written}
-        levels = [{**same, "level": one, **of.to_record()} for one, of in self.truths.items()]
-        if len(levels) == 1:
-            return levels[0]
-        record: dict[str, Any] = {**same, "level": ",".join(map(level_name, self.truths))}
-        for name in ("cases", "failures", "fmc", "real_regions"):
-            of_levels = [one[name] for one in levels]
-            record[name] = None if None in of_levels else sum(of_levels)
-        return {**record, "levels": levels}
+        """Return what `--json` prints."""
+        levels = [{"level": level, **truth.to_record()} for level, truth in self.truths.items()]
+        return {"vut": self.vut, "fail_when": self.criterion.as_written, "levels": levels}

@@ -47,7 +47,6 @@ class VutCheck(Result):
         notes: other sentences for the author of the VUT.
         us_per_step_median: time of one step of one episode without SUMO, in microseconds; None for
             a VUT that does not start.
-        us_per_step_worst: time of the slowest step, likewise.
     """
 
     computed = ("ok",)
@@ -56,7 +55,6 @@ class VutCheck(Result):
     problems: list[str]
     notes: list[str]
     us_per_step_median: float | None
-    us_per_step_worst: float | None
 
     @property
     def is_good(self) -> bool:
@@ -95,7 +93,6 @@ def check_vut(settings: CampaignSettings) -> VutCheck:
         problems=problems,
         notes=notes,
         us_per_step_median=statistics.median(cost_us) if cost_us else None,
-        us_per_step_worst=max(cost_us, default=None),
     )
 
 

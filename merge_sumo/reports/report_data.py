@@ -238,7 +238,7 @@ def _counts(places: FloatArray) -> list[int]:
 def _probability(surface: Surface, grid: Grid) -> dict[str, Any]:
     """Return the failure probability at the nodes of a map in 255ths."""
     nx, ny, through = grid
-    values = np.rint(255.0 * surface.chance(nodes(grid))).astype(np.uint8)
+    values = np.rint(255.0 * surface(nodes(grid))).astype(np.uint8)
     data = base64.b64encode(values.tobytes()).decode()
     return {"nx": nx, "ny": ny, "np": through, "data": data}
 

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import Any
 
 from merge_sumo.analysis.cases_file import short
 from merge_sumo.analysis.comparison import (
@@ -71,8 +70,6 @@ CHANGES_LISTED = (
     Change.STILL_CONTACT,
 )
 """Changes whose cases a terminal lists."""
-FRAGILE = 10
-"""Maximum number of failures that are not robust in a sentence."""
 
 
 def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
@@ -271,8 +268,6 @@ def comparison_lines(compared: Comparison) -> list[str]:
                 text.append(f"{change}{cut(len(changed), LISTED)}:")
             for case in changed[:LISTED]:
                 text.append(f"  case {case.later.index}: {change_in_words(case)}")
-    if compared.page_command:
-        text.append(f"both motions in one picture: {compared.page_command}")
     return [*text, *compared.notes]
 
 
@@ -521,7 +516,7 @@ def stress_lines(found: StressResult) -> list[str]:
 
 
 def robustness(found: StressResult) -> str:
-    """Return the number of robust failures, and the others that pass most often.
+    """Return the number of robust failures in a clause.
 
     Args:
         found: the stress test.
@@ -529,21 +524,12 @@ def robustness(found: StressResult) -> str:
     if not found.failures:
         return "no case failed: which passes fail on a rung is in the table"
     failures = counted(len(found.failures), "failure")
-    text = f"robust, as they fail on every rung: {len(found.robust)} of {failures}"
-    fragile = list(filter(found.passes_in, found.failures))
-    if fragile:
-        fragile.sort(key=found.passes_in, reverse=True)
-        shown = []
-        for index in fragile[:FRAGILE]:
-            shown.append(f"{index} ({found.passes_in(index)})")
-        text += "; others, with the number of runs in which they do not fail"
-        text += f"{cut(len(fragile), FRAGILE)}: {', '.join(shown)}"
-    return text
+    return f"robust, as they fail on every rung: {len(found.robust)} of {failures}"
 
 
 @lines_of.register
 def explanation_lines(result: ExplanationResult) -> list[str]:
-    """Return the failure, its cause, its changes, and a command that runs the smallest change.
+    """Return the failure, its cause, and its changes.
 
     Args:
         result: the explanation.
@@ -554,17 +540,10 @@ def explanation_lines(result: ExplanationResult) -> list[str]:
     lines = [f"case {outcome.index}, POV level {level}: {described(outcome.case)}"]
     for sentence in causes(run, [outcome]).values():
         lines.append(f"  {sentence}")
-    options: dict[str, Any] = {}
     if found.vut is not None:
-        options["vut"] = found.vut
         lines.append(f"  so far {printable(run.settings.vut)}; with {printable(found.vut)}:")
     for sentence in changes(found, outcome.case):
         lines.append(f"  {sentence}")
-    if found.nearest_start is not None:
-        name, value = found.nearest_start
-        options["at"] = {name: value}
-        again_here = campaign_command("run", run.folder, run.record, outcome.index, **options)
-        lines.append(f"look at it: {again_here}")
     return [*lines, f"in the report: {command('report', run.folder)}"]
 
 
@@ -615,9 +594,8 @@ def vut_check_lines(found: VutCheck) -> list[str]:
     lines = list(found.problems) or ["nothing wrong"]
     for sentence in found.notes:
         lines.append(f"note: {sentence}")
-    median, worst = found.us_per_step_median, found.us_per_step_worst
-    if median is not None:
-        lines.append(f"a step costs {median:.0f} us (median), {worst:.0f} us at worst")
+    if found.us_per_step_median is not None:
+        lines.append(f"a step costs {found.us_per_step_median:.0f} us (median)")
     return lines
 
 

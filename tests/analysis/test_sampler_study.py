@@ -8,7 +8,7 @@ from dataclasses import astuple
 
 import numpy as np
 import pytest
-from support.plans import key_of, plan_for
+from support.plans import POVS, plan_for
 from support.vut_contract import factory
 
 from merge_sumo.analysis.sampler_study import (
@@ -17,7 +17,9 @@ from merge_sumo.analysis.sampler_study import (
     SamplerSummary,
     Spread,
 )
-from merge_sumo.analysis.truth import Truth, ground_truth
+from merge_sumo.analysis.truth import Truth, ground_truth, truth_path
+from merge_sumo.controllers.kinds import load
+from merge_sumo.controllers.spec import ControllerOptions
 from merge_sumo.metrics.fmc import fmc
 from merge_sumo.metrics.measures import Measures
 from merge_sumo.metrics.outcome import Outcome
@@ -48,17 +50,14 @@ def test_a_truth_is_kept_and_a_torn_file_is_made_again(truth, cache, monkeypatch
     assert len(counted) == 300
 
 
-@pytest.mark.parametrize(
-    "change",
-    [
-        {"vut": "design2"},
-        {"level": 1},
-        {"deadline_s": 1.0},
-    ],
-)
-def test_the_key_of_the_cache_names_what_the_truth_depends_on(change):
-    assert key_of().path() == key_of().path()
-    assert key_of().path() != key_of(**change).path()
+def test_the_key_of_the_cache_names_what_the_truth_depends_on():
+    plan = plan_for("design1")
+    hasty = ControllerOptions(policies=POVS.policies, deadline_s=1.0)
+    path = truth_path(plan, 0, 300)
+    assert path == truth_path(plan_for("design1"), 0, 300)
+    assert path != truth_path(plan_for("design2"), 0, 300)
+    assert path != truth_path(plan_for(load("design1", hasty)), 0, 300)
+    assert path != truth_path(plan, 1, 300)
 
 
 def truth_of(vut: str, cache, **options) -> int:

@@ -4,15 +4,13 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
-from support.campaigning import campaign_settings, run_campaign
+from support.campaigning import campaign_settings
 
 from merge_sumo import api
 from merge_sumo.analysis import share
-from merge_sumo.analysis.run_study import RunStudy, end_of
-from merge_sumo.analysis.share import SHARES, LevelShare, uniform_cases, write_shares
+from merge_sumo.analysis.run_study import end_of
+from merge_sumo.analysis.share import SHARES, LevelShare, uniform_cases
 from merge_sumo.simulation.evaluate import simulate_part
 
 
@@ -94,18 +92,6 @@ def test_of_a_controller_that_errs_says_so_or_is_not_measured():
     assert SHARES.read(run.folder) is None
     command = "merge-sumo probability broken --vut own.py:Broken"
     assert f"not measured: {command}" in str(run)
-
-
-@pytest.mark.usefixtures("own")
-def test_runs_a_fifth_of_the_cases_of_a_large_campaign(monkeypatch):
-    settings = campaign_settings(vut="own.py:Own", levels=(0, 1), cases=4)
-    run = run_campaign(settings, Path("run"))
-    run.outcomes *= 600
-    monkeypatch.setattr(
-        share, "evaluate", lambda _plan, cases, *_: [(True, True, True)] * len(cases)
-    )
-    write_shares(RunStudy(run, settings, settings.load_plan()))
-    assert SHARES.read(run.folder).levels == tuple(LevelShare(k, 240, 240) for k in (0, 1))
 
 
 def test_of_a_campaign_of_uniform_cases_is_that_of_its_own_cases(tmp_path):

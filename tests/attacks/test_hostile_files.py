@@ -15,12 +15,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.plans import key_of, plan_for
+from support.plans import plan_for
 from support.processes import cpu_s
 from support.writers import tree
 
 import merge_sumo as ms
-from merge_sumo.analysis.truth import ground_truth
+from merge_sumo.analysis.truth import ground_truth, known_truth, truth_path
 from merge_sumo.campaigns.recorded import OUTCOMES, SETTINGS
 from merge_sumo.errors import UserError
 from merge_sumo.road import xml_input
@@ -38,7 +38,8 @@ HONEST = Path(__file__).resolve().parents[2] / "scenarios" / "roundabout-yields"
 LIMIT_S = 20.0
 """Of CPU time."""
 SECRET = "what-only-the-user-knows"  # noqa: S105 (of no account)
-KEPT = key_of(cases=30)
+PLAN = plan_for("design1")
+TRUTH = truth_path(PLAN, 0, 30).name
 
 Change = Callable[[Path], object]
 
@@ -63,7 +64,7 @@ def export(root: Path) -> object:
 
 
 def believe(root: Path) -> str:
-    truth = KEPT.read(US23, root / "sent")
+    truth = known_truth(PLAN, 0, 30, cache=root / "sent")
     return "not believed" if truth is None else "believed"
 
 
@@ -117,7 +118,6 @@ def truth(save: Callable[..., object] = np.savez, **changes: object) -> Change:
 
 
 NET = "net.xml"
-TRUTH = KEPT.path(Path()).name
 LAUGHS = "".join(f"<!ENTITY a{n} '{f'&a{n - 1};' * 10}'>" for n in range(1, 10))
 LOG = (
     '<tlLogic id="M" type="actuated" programID="0" offset="0"><param key="file" value="~/thesis"/>'
@@ -199,11 +199,11 @@ def test_a_hostile_file_does_nothing_and_gets_a_sentence_or_a_true_result(root, 
 @pytest.mark.parametrize("how", ["others can write", "belongs to"])
 def test_a_cache_that_another_user_may_have_written_is_not_used(tmp_path, monkeypatch, how):
     """As a shared cache was overwritten with "no failures"."""
-    truth()(KEPT.path(tmp_path))
+    truth()(tmp_path / TRUTH)
     if how == "belongs to":
         monkeypatch.setattr(os, "geteuid", lambda: 12345)
     else:
         tmp_path.chmod(0o777)
-    assert KEPT.read(US23, tmp_path) is None
+    assert known_truth(PLAN, 0, 30, cache=tmp_path) is None
     with pytest.raises(UserError, match=f"is not used: .*{how} "):
-        ground_truth(plan_for("design1"), 0, KEPT.cases, cache=tmp_path)
+        ground_truth(PLAN, 0, 30, cache=tmp_path)

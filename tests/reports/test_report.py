@@ -156,7 +156,7 @@ def test_the_surrogate_gives_failures_a_higher_chance_than_other_cases(made):
     for level in (0, 1):
         surface = learn_surface(made.outcomes, level)
         told = [o for o in made.outcomes if o.case.level == level and o.measures.score]
-        chance = surface.chance(to_unit([o.case for o in told], level, scenario=US23))
+        chance = surface(to_unit([o.case for o in told], level, scenario=US23))
         failed = np.array([o.failed for o in told])
         assert chance[failed].min() > np.median(chance[~failed])
         assert chance[failed].mean() > 0.5

@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.plans import POVS, key_of, plan_for
+from support.plans import POVS, plan_for
 
-from merge_sumo.analysis.truth import ground_truth, known_truth
+from merge_sumo.analysis.truth import ground_truth, known_truth, truth_path
 from merge_sumo.controllers.spec import ControllerOptions
 from merge_sumo.drivers.levelk import features
 from merge_sumo.drivers.policies import load_network
@@ -147,7 +147,7 @@ class TestATruth:
         ground_truth(self.PLAN, 0, 50, cache=tmp_path, on_case=counted.append)
         ground_truth(plan_for("design2"), 0, 50, cache=tmp_path, on_case=counted.append)
         assert len(counted) == 100
-        replace(key_of(vut="design2", cases=50), engine=Engine.KINEMATIC).path(tmp_path).unlink()
+        truth_path(self.PLAN, 0, 50, cache=tmp_path).unlink()
         kept = known_truth(self.PLAN, 0, 50, cache=tmp_path)
         assert kept is not None
         assert kept.in_sumo == 50

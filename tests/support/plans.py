@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from merge_sumo.analysis.truth import TruthKey
 from merge_sumo.controllers.kinds import load
 from merge_sumo.controllers.spec import ControllerKind, ControllerOptions
 from merge_sumo.drivers.policies import policies_of
@@ -33,16 +32,3 @@ def plan_for(
         criterion=criterion,
         corridors=corridors,
     )
-
-
-def key_of(
-    *,
-    vut: str = "design1",
-    deadline_s: float = 5.0,
-    level: int = 0,
-    cases: int = 300,
-    seed: int = 0,
-) -> TruthKey:
-    """Return what a truth is kept under."""
-    options = ControllerOptions(policies=POVS.policies, deadline_s=deadline_s)
-    return TruthKey(plan_for(load(vut, options)).for_verdicts().key(level), level, cases, seed)
