@@ -31,8 +31,6 @@ from merge_sumo.metrics.summary import LevelSummary, Summary, by_case
 from merge_sumo.printable import printable
 
 PERCENT = "%"
-SCATTERED = "scattered"
-"""Regions of a level whose failures mostly lie alone."""
 
 # Names of facts that the terminal and the templates look up.
 VUT = "VUT"
@@ -188,9 +186,7 @@ def _of_level(run: RecordedCampaign, level: int, summary: LevelSummary, failing:
         yield fact(FAILURES, summary.failures, failing)
         if run.tolerated:
             yield fact(UNDECIDED, summary.undecided, "draw")
-        number = summary.failures + summary.undecided
-        scattered = number >= 10 and 2 * summary.regions > number
-        yield fact(REGIONS, SCATTERED if scattered else summary.regions, f"{failing}: starts")
+        yield fact(REGIONS, summary.regions, f"{failing}: starts")
         radius = radius_for(len(run.scenario.dimensions(level)))
         yield fact(FMC, summary.fmc, f"{failing}: starts within {radius:.2g}")
     if run.scenario.lane_m is None:

@@ -6,7 +6,6 @@ Each writes one type of result. `headline`, `causes` and `episode_lines` write c
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
 
 from merge_sumo.analysis.cases_file import short
 from merge_sumo.analysis.comparison import (
@@ -29,7 +28,6 @@ from merge_sumo.campaigns.printed_commands import campaign_command, command
 from merge_sumo.campaigns.recorded import RecordedCampaign
 from merge_sumo.drivers.reference_drivers import REFERENCE_DRIVERS
 from merge_sumo.metrics.cause import cause, conflicting_car
-from merge_sumo.metrics.criterion import Criterion
 from merge_sumo.metrics.fmc import fmc
 from merge_sumo.metrics.measures import measures_in
 from merge_sumo.metrics.merge import Conflict
@@ -49,7 +47,6 @@ from merge_sumo.reports.facts import (
     PROBABILITY_TO_FAIL,
     REGIONS,
     RULE,
-    SCATTERED,
     STARTS,
     STARTS_THAT_FAIL,
     UNDECIDED,
@@ -60,7 +57,7 @@ from merge_sumo.reports.facts import (
 )
 from merge_sumo.result import lines_of
 from merge_sumo.scenario.case import Case, coordinates, described
-from merge_sumo.scenario.scenario import DT_S, US23, VEHICLES, level_name
+from merge_sumo.scenario.scenario import DT_S, VEHICLES, level_name
 from merge_sumo.scenario.trajectory import Trajectory
 
 CHANGES_LISTED = (
@@ -115,17 +112,13 @@ def headline(run: RecordedCampaign, facts: Sequence[Fact]) -> list[str]:
     for line in aligned([_level_cells(level, row) for level, row in levels.items()]):
         lines.append(f"  {line}")
 
-    remarks = []
     if CONTACT in of:
         contacts = _counted(of[CONTACT], "more case")
-        remarks.append(f"contact after the merge in {contacts}: `fail_when` unsafe counts them")
+        lines.append(f"contact after the merge in {contacts}: `fail_when` unsafe counts them")
     has_shares = any(STARTS_THAT_FAIL in row for row in levels.values())
     if not has_shares and PROBABILITY_TO_FAIL not in of:
         measure = campaign_command("probability", run.folder, run.record)
-        remarks.append(f"{STARTS_THAT_FAIL} are not measured: {measure}")
-    if remarks:
-        lines.append("; ".join(remarks))
-
+        lines.append(f"{STARTS_THAT_FAIL} are not measured: {measure}")
     if AVOIDED_BY_POV in of:
         lines.append(_avoided(of))
     if WORST in of:
@@ -158,8 +151,7 @@ def _level_cells(level: int, of: Mapping[str, Fact]) -> list[str]:
         if UNDECIDED in of and of[UNDECIDED].value:
             failures += f", {of[UNDECIDED].shown} undecided"
         if of[FMC].value:
-            is_number = of[REGIONS].value != SCATTERED
-            regions = _counted(of[REGIONS], "region") if is_number else SCATTERED
+            regions = _counted(of[REGIONS], "region")
             coverage = f"FMC {of[FMC].shown}"
     return [f"level {level_name(level)}", share, failures, regions, coverage]
 
@@ -461,10 +453,6 @@ def probability_lines(found: ProbabilityResult) -> list[str]:
     if found.overall is None or len(found.levels) > 1:
         for level, estimate in found.levels.items():
             lines.append(f"  level {level_name(level)}: P(fail) {_interval(estimate)}")
-    criterion = Criterion(found.campaign["fail_when"], found.campaign["require"])
-    # The result has the scenario as in its file; the clause needs only this number of it.
-    scenario = replace(US23, dx_crash_m=found.campaign["scenario"]["dx_crash_m"])
-    lines.append(f"  a case fails when {criterion.description(scenario)}")
     if found.without_verdict:
         lines.append(
             f"  {found.without_verdict} not judged (error or timeout): safe for lower ends, "
