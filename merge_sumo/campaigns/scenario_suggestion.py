@@ -11,7 +11,7 @@ import numpy as np
 
 from merge_sumo.drivers.level0 import level0_time_to
 from merge_sumo.drivers.policies import policies_of, read_manifest, scenario_of
-from merge_sumo.road.road import LanePath, Road, lane_around_m
+from merge_sumo.road.road import Road, lane_around_m
 from merge_sumo.scenario.scenario import MAX_EPISODE_S, US23, V_VUT0_MPS, Bounds, Scenario, Units
 
 MARGIN: Final = 0.15
@@ -52,11 +52,11 @@ def suggested(road: Road, name: str) -> Scenario:
         road: the road.
         name: name of the scenario.
     """
-    limit_mps = min(limit_at(road.mainline, -1.0), US23.v_hw_max_mps)
+    limit_mps = min(road.mainline.piece(-1.0).speed_limit_mps, US23.v_hw_max_mps)
     gore_m = road.lane_m[0] if road.lane_m else 0.0
     far_m = min(US23.x_vut0_m, gore_m - BEFORE_GORE_M)
     x_vut0_m = _down(max(far_m, gore_m - ROOM * (road.ramp.before_m + gore_m)))
-    v_vut0_mps = round(min(V_VUT0_MPS, limit_at(road.ramp, x_vut0_m)), 1)
+    v_vut0_mps = round(min(V_VUT0_MPS, road.ramp.piece(x_vut0_m).speed_limit_mps), 1)
     level0_v_mps = round(min(US23.level0_v_mps, limit_mps), 1)
     lane_m = road.lane_m and suggested_lane_m(road)
     way_m = np.array([0.0, lane_m[1] if lane_m else 0.0]) - x_vut0_m
@@ -88,17 +88,6 @@ def suggested(road: Road, name: str) -> Scenario:
 
 def _down(x_m: float) -> float:
     return math.ceil(x_m * 10.0) / 10.0
-
-
-def limit_at(path: LanePath, x_m: float) -> float:
-    """Return the speed limit at a coordinate of a path, in m/s.
-
-    Args:
-        path: the path.
-        x_m: the coordinate; M is 0.
-    """
-    found = [limit for start_m, limit in path.speed_limits_mps() if start_m <= x_m]
-    return found[-1] if found else path.speed_limits_mps()[0][1]
 
 
 def about(road: Road) -> list[str]:

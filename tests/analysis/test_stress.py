@@ -68,13 +68,17 @@ def test_the_report_lists_robust_failures_first_where_there_is_a_stress_test(run
     assert "What hangs by a thread" not in page
     assert "Worst failures, one of each region first" in page
     *others, robust = found.failures
-    flips = Flips(tuple(others))
-    kept = structs.replace(found, rungs=(Rung("one", "<b>one</b>", runs=(flips,)),))
+    rungs = (
+        Rung("one", "<b>one</b>", runs=(Flips(tuple(others)),)),
+        Rung("nothing", "nothing is changed", runs=(Flips(fails=(0,)),)),
+    )
+    kept = structs.replace(found, rungs=rungs)
     (run.folder / STRESS.name).write_text(json.dumps(to_plain(kept)))
     page = Path(run.report()).read_text(encoding="utf-8")
     (run.folder / STRESS.name).unlink()
     assert STRESS.read(run.folder) is None
     assert "What hangs by a thread" in page
+    assert "1 verdict flipped where nothing was changed" in page
     assert "&lt;b&gt;one&lt;/b&gt;" in page
     assert "<b>one</b>" not in page
     listed = page[page.index("Worst failures, robust ones first") :]
