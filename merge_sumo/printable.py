@@ -1,10 +1,11 @@
-"""Names in sentences: as a terminal and a shell may see them."""
+"""Names in sentences: as a terminal and a shell may see them, and which one a user may mean."""
 
 from __future__ import annotations
 
 import os
 import shlex
 from collections.abc import Iterable
+from difflib import get_close_matches
 from pathlib import Path
 from unicodedata import category
 
@@ -70,3 +71,18 @@ def either(names: Iterable[str]) -> str:
     """
     ordered = list(names)
     return ordered[0] if len(ordered) == 1 else f"{', '.join(ordered[:-1])} or {ordered[-1]}"
+
+
+def meant(name: str, known: Iterable[str], alike: float = 0.6) -> str:
+    """Return "did you mean a or b? " where known names are like a name, else nothing.
+
+    Args:
+        name: the name; its case does not matter.
+        known: the known names.
+        alike: ratio of matching characters that they must have, from 0 to 1.
+    """
+    by_folded = {other.casefold(): other for other in known}
+    near = get_close_matches(name.casefold(), by_folded, 3, alike)
+    if not near:
+        return ""
+    return f"did you mean {either([by_folded[folded] for folded in near])}? "

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Generic, TypeVar
 
 from merge_sumo.errors import UserError
+from merge_sumo.printable import meant
 
 T = TypeVar("T")
 
@@ -82,7 +83,10 @@ class Registry(Mapping[str, T], Generic[T]):
                 f"{packages} bring a {self.noun} {name!r}: uninstall all but one of them"
             )
         if not bringers:
-            raise UserError(f"there is no {self.noun} {name!r}: choose one of {', '.join(self)}")
+            raise UserError(
+                f"there is no {self.noun} {name!r}: {meant(name, self)}choose one of "
+                f"{', '.join(self)}"
+            )
         ((package, entry),) = bringers.items()
         if not isinstance(entry, EntryPoint):
             return entry

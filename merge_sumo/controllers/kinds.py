@@ -17,6 +17,7 @@ from merge_sumo.controllers.spec import (
     load_as,
 )
 from merge_sumo.errors import UserError
+from merge_sumo.printable import meant
 from merge_sumo.registry import Registry
 
 KINDS: Registry[type[ControllerKind]] = Registry(
@@ -92,7 +93,7 @@ def _why_unknown(name: str) -> str:
     choice = f"{', '.join(names)}, or bring your own (`merge-sumo vuts` lists the kinds)"
     if not name:
         return f"name the vehicle under test, as in `vut` design2: {choice}"
-    return f"there is no VUT {name!r}: choose one of {choice}"
+    return f"there is no VUT {name!r}: {meant(name, (*names, *KINDS))}choose one of {choice}"
 
 
 def is_built_in(text: str) -> bool:

@@ -16,7 +16,7 @@ from collections.abc import Callable, Mapping, Sequence, Set
 from typing import Any, NamedTuple
 
 from merge_sumo.errors import UserError
-from merge_sumo.printable import either, printable
+from merge_sumo.printable import either, meant, printable
 
 Value = float | str
 """A number, which may be infinite, or a text."""
@@ -159,8 +159,9 @@ class _Parser:
         raise self._error(f"{shown} is neither a measure nor a number nor a text")
 
     def _unknown(self, name: str) -> UserError:
-        known = ", ".join((*self._vocabulary, *self._named))
-        return self._error(f"no measure {printable(name)!r} (a text is in quotes): choose {known}")
+        known = *self._vocabulary, *self._named
+        hint = meant(name, known) or f"choose {', '.join(known)}"
+        return self._error(f"no measure {printable(name)!r} (a text is in quotes): {hint.strip()}")
 
     def _error(self, why: str) -> UserError:
         return UserError(f"{self._what}: {why}")

@@ -20,6 +20,7 @@ from typing import Any, NamedTuple
 from lxml import etree
 
 from merge_sumo.errors import UserError, explained
+from merge_sumo.printable import meant
 from merge_sumo.road.road import (
     AccelerationLane,
     Approach,
@@ -270,7 +271,8 @@ def _check_edge(road_net: RoadNet, name: str) -> None:
     """Raise `UserError` where a net has no such edge, or cars may not drive there."""
     net = road_net.net
     if not net.hasEdge(name) or net.getEdge(name).isSpecial():
-        raise UserError(f"it has no edge {name}: name edges of the net")
+        hint = meant(name, road_net.edges, 0.5)  # ids of edges are short
+        raise UserError(f"it has no edge {name}: {hint}name edges of the net")
     if not _lanes(net, name):
         raise UserError(f"no lane of edge {name} is open to cars")
 
