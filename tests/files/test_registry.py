@@ -62,7 +62,7 @@ def test_a_name_of_two_packages_names_both(install):
 
 
 def test_an_unknown_name_is_one_sentence():
-    with pytest.raises(UserError, match=r"no tool 'our': choose one of ours, "):
+    with pytest.raises(UserError, match=r"no tool 'our': did you mean ours\? choose one of ours, "):
         registry()["our"]
 
 

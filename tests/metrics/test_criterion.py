@@ -94,8 +94,8 @@ class TestParsing:
         ("text", "said"),
         [
             ("speed > 3", "no measure 'speed' (a text is in quotes): choose score, dx_m, "),
-            ("tcc_s < 1.5", "'tcc_s' (a text is in quotes): choose "),
-            ("papr", "choose score"),
+            ("tcc_s < 1.5", "'tcc_s' (a text is in quotes): did you mean ttc_s"),
+            ("papr", "did you mean paper?"),
             ('end == "TIMEOT"', "never 'TIMEOT': it is MERGED or TIMEOUT"),
             ('end < "TIMEOUT"', "compare it with == or !="),
             ("end == merged_first", "with a text in quotes"),
@@ -171,7 +171,7 @@ class TestNamed:
         assert of(either.as_written, hard) == pytest.approx(-1.0 / 3.0)
         assert of(either.as_written, ending(9.0, end=End.TIMEOUT)) == -1.0
         assert of("not (contact or paper)", ending(-25.0, v_pov=27.0)) < 0.0
-        with pytest.raises(UserError, match=r"choose .*, unsafe"):
+        with pytest.raises(UserError, match="did you mean unsafe"):
             Criterion("unsave or ttc_s < 1")
 
     def test_unsafe_is_also_who_must_brake_harder_than_3(self):
