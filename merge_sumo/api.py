@@ -84,7 +84,6 @@ from merge_sumo.reports.progress import Bars, CampaignBars
 from merge_sumo.reports.report import RunningReport, check_report, write_report
 from merge_sumo.result import Shown
 from merge_sumo.road.scenario_file import SUFFIX
-from merge_sumo.scenario.case import outside_of_the_pool
 from merge_sumo.scenario.scenario import LEVELS, US23, AnyLevels, Scenario, level_name
 from merge_sumo.simulation.evaluate import simulate
 from merge_sumo.simulation.plan import Engine, SimulationPlan
@@ -208,8 +207,6 @@ def run(config: c.RunCase) -> CaseRun:
     settings, case = planned_case(config, before)
     if config.out is not None:
         check_new(Path(config.out))
-    for sentence in outside_of_the_pool(case):
-        notice(sentence)
     plan = settings.load_plan(debug=config.debug)
     if before is not None:
         run_study.notice_changes(before, plan)

@@ -18,7 +18,6 @@ from merge_sumo.metrics.measures import Measures, measures_in
 from merge_sumo.metrics.merge import Severity
 from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.records import Record, convert, read_toml, to_json
-from merge_sumo.scenario.case import outside_of_the_pool
 from merge_sumo.scenario.scenario import Scenario
 from merge_sumo.scenario.trajectory import End
 from merge_sumo.simulation.povs import POLICIES
@@ -105,8 +104,6 @@ class CasesFile(RecordedCampaign):
             raise UserError(f"verdict is {verdict!r:.60}, but by margin and end it is {judged}")
         if outcome.index in self._by_index:
             raise UserError("its index is there twice")
-        if sentences := outside_of_the_pool(outcome.case):
-            raise UserError(sentences[0])
         self._by_index[outcome.index] = outcome
         if accepted is not None:
             if not (isinstance(accepted, str) and accepted.strip()):

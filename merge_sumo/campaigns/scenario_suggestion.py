@@ -104,12 +104,11 @@ def about(road: Road) -> list[str]:
     if road.is_one_path:
         paths = {"lane of all vehicles": paths["mainline"]}
     for name, (path, edges) in paths.items():
-        limits = []  # those after M, too: all drive on there
-        for start_m, limit_mps in path.speed_limits_mps():
-            limits.append(f"{limit_mps:g} m/s from {start_m:.0f} m")
+        # Those after M, too: all drive on there.
+        limits_mps = [piece.speed_limit_mps for piece in path.pieces]
         lines.append(
-            f"{name}: {' '.join(edges)}, {path.before_m:.1f} m before M; "
-            f"limits: {', '.join(limits)}"
+            f"{name}: {' '.join(edges)}, {path.before_m:.1f} m before M; speed limits from "
+            f"{min(limits_mps):g} to {max(limits_mps):g} m/s"
         )
     m = road.lane_point(0.0, on_ramp=road.lane_m is None)
     merge = f"M: lane {m.lane} at ({m.x_m:.1f}, {m.y_m:.1f})"

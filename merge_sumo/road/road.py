@@ -166,14 +166,6 @@ class LanePath:
             distances.append((away_m, begin_m + along * (end_m - begin_m)))
         return min(distances)
 
-    def speed_limits_mps(self) -> list[tuple[float, float]]:
-        """Return (lane coordinate, limit after it) wherever the speed limit changes."""
-        limits: list[tuple[float, float]] = []
-        for piece in self.pieces:
-            if not limits or limits[-1][1] != piece.speed_limit_mps:
-                limits.append((piece.start_m, piece.speed_limit_mps))
-        return limits
-
 
 @dataclass(frozen=True, slots=True)
 class Approach:

@@ -278,20 +278,3 @@ def described(case: Case) -> str:
     for c in case.scenario.dimensions(case.level):
         texts.append(f"{c.name} {c.text(case)} {c.unit}")
     return ", ".join(texts)
-
-
-def outside_of_the_pool(case: Case) -> list[str]:
-    """Return a sentence for each coordinate of a case that is outside of the pool.
-
-    Args:
-        case: the case.
-    """
-    sentences = []
-    for c in case.scenario.dimensions(case.level):
-        value = c.of(case)
-        if value is not None and not c.low <= value <= c.high:
-            sentences.append(
-                f"{c.name} {c.text(case)} {c.unit} is outside of the pool, {c.low:g} to {c.high:g} "
-                f"{c.unit}: no campaign runs such a case"
-            )
-    return sentences

@@ -279,7 +279,7 @@ def test_a_net_of_the_user_is_found_from_the_file(tmp_path):
         ("tolerance = 0.01", "tolerence = 0.01", "has no 'tolerence': it has vut, "),
         ('scenario = {name = "us23"}', 'scenario = "us99"', "scenario is 'us99': it must be a"),
         ('fail_when = "paper"', 'fail_when = "scores < 3"', "no measure 'scores'"),
-        ("x_pov0_m = -", "x_pov0_m = -500.5, dx_m = -", "is outside of the pool, -340 to -180 m"),
+        ("x_pov0_m = -", "x_pov0_m = -900.5, dx_m = -", "x_pov0_m is -900.5: choose -900 to 0"),
         ("v_pov0_mps = ", "v_pov0_mps = nan, dx_m = ", "it has a number that is not finite"),
         ('"pass"', '"fail"', "verdict is 'fail', but by margin and end it is pass"),
         ("},", ', accepted = " "},', "accepted is ' ': it must be a reason"),
