@@ -16,7 +16,7 @@ from merge_sumo.config import AnyRun
 from merge_sumo.metrics.cause import cause
 from merge_sumo.metrics.measures import Measures
 from merge_sumo.metrics.outcome import Episode, Outcome
-from merge_sumo.metrics.plausibility import doubts, in_vain, mostly_clipped
+from merge_sumo.metrics.plausibility import doubts, in_vain
 from merge_sumo.metrics.summary import (
     GateResult,
     Summary,
@@ -168,7 +168,6 @@ class CampaignRun(Result):
         judged; `worst_case` is the index of the failure with the lowest margin.
         """
         shares, worst = SHARES.read(self.folder), failures(self.recorded.cases)
-        criterion, at_limits = self.recorded.criterion, mostly_clipped(self.recorded.cases)
         return {
             **self.summary.to_record(),
             "worst_case": worst[0].index if worst else None,
@@ -176,8 +175,8 @@ class CampaignRun(Result):
             "gates": {gate.name: gate.met for gate in self.gates},
             "passed": self.passed,
             "stopped": "converged" if self.converged else "cases",
-            "fail_when": criterion.as_written,
-            "notes": [*filter(None, [at_limits]), *self._doubts],
+            "fail_when": self.recorded.criterion.as_written,
+            "notes": self._doubts,
             **(
                 {}
                 if self.against is None
@@ -200,7 +199,6 @@ class CampaignRun(Result):
         optional = [
             unrepeatable(self.repeats),
             tested,
-            mostly_clipped(run.cases),
             *self.summary.error_lines(),
             *found,
             *repeated,

@@ -21,7 +21,7 @@ from merge_sumo.controllers.python import installed_vuts
 from merge_sumo.drivers.base import Driver, DriverWrapper, Scene
 from merge_sumo.drivers.policies import policies_in, policies_of, read_manifest
 from merge_sumo.errors import ControllerError, UserError
-from merge_sumo.metrics.plausibility import doubts, mostly_clipped
+from merge_sumo.metrics.plausibility import doubts
 from merge_sumo.result import Result, Shown
 from merge_sumo.scenario.case import Case, FloatArray, from_unit
 from merge_sumo.scenario.scenario import US23, Scenario
@@ -184,9 +184,7 @@ def _notes(plan: SimulationPlan, driven: Sequence[Trajectory]) -> list[str]:
     for index, trajectory in enumerate(driven):
         outcomes.append(plan.criterion.outcome(trajectory, index=index))
         in_vain.update(trajectory.in_vain)
-    clipped = mostly_clipped(outcomes)
-    notes = doubts(outcomes, in_vain)
-    return notes if clipped is None else [clipped, *notes]
+    return doubts(outcomes, in_vain)
 
 
 def _ordinary_cases(scenario: Scenario) -> list[Case]:

@@ -15,8 +15,6 @@ from merge_sumo.errors import UserError
 from merge_sumo.metrics.bodies import CentreLines
 from merge_sumo.metrics.expression import Condition, Value, Vocabulary, parse_condition
 from merge_sumo.metrics.measures import (
-    FOLLOW_UP,
-    LANE,
     MEASURES,
     Measures,
     known_measures,
@@ -117,18 +115,13 @@ class Criterion:
         if self.require is not None:
             try_formula(self.require)
             return
-        recorded = measures_in(scenario)
-        for name in sorted(condition_of(self.condition).names - recorded.keys()):
-            if MEASURES[name].only_with == FOLLOW_UP:
-                raise UserError(
-                    f"`fail_when` speaks of {name}, which is measured "
-                    f"{scenario.wording('after M')}: say how long with `follow_up_s` SECONDS"
-                )
-            if MEASURES[name].only_with == LANE:
-                raise UserError(
-                    f"`fail_when` speaks of {name}, and {scenario.name} has no acceleration "
-                    "lane: choose a scenario with one, such as us23-lane"
-                )
+        missing = condition_of(self.condition).names - measures_in(scenario).keys()
+        if missing:
+            name = min(missing)
+            raise UserError(
+                f"`fail_when` speaks of {name}, which needs {MEASURES[name].only_with}: choose "
+                f"another scenario than {scenario.name}, or a `follow_up_s` above 0"
+            )
 
     @property
     def is_of_paper(self) -> bool:

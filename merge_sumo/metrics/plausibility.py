@@ -11,8 +11,6 @@ from merge_sumo.scenario.scenario import DT_S
 
 CLIPPED_SHARE = 0.01
 """Share of clipped steps above which a note says so."""
-MOSTLY_CLIPPED = 0.5
-"""Share of clipped steps above which a headline says so: the limits drove, and not the VUT."""
 
 
 def doubts(outcomes: Sequence[Outcome], vain: Mapping[str, int]) -> list[str]:
@@ -22,9 +20,7 @@ def doubts(outcomes: Sequence[Outcome], vain: Mapping[str, int]) -> list[str]:
         outcomes: outcomes of a campaign.
         vain: number of cases by command without an effect.
     """
-    clipped = _clipped(outcomes, CLIPPED_SHARE)
-    often = [] if clipped is None or mostly_clipped(outcomes) else [clipped]
-    return [*often, *late_errors(outcomes), *in_vain(vain)]
+    return [*_clipped(outcomes), *late_errors(outcomes), *in_vain(vain)]
 
 
 def late_errors(outcomes: Sequence[Outcome]) -> Iterator[str]:
@@ -49,24 +45,14 @@ def in_vain(cases: Mapping[str, int]) -> list[str]:
     return [f"commanded in vain, because it changes nothing here: {listed}"] if cases else []
 
 
-def mostly_clipped(outcomes: Sequence[Outcome]) -> str | None:
-    """Return a sentence on a VUT that drove at its limits in most steps; None for others.
-
-    Args:
-        outcomes: outcomes of a campaign.
-    """
-    clipped = _clipped(outcomes, MOSTLY_CLIPPED)
-    return clipped and f"not driven as asked: {clipped}; check the unit and the sign of its answers"
-
-
-def _clipped(outcomes: Sequence[Outcome], share: float) -> str | None:
-    """Return in how many steps a VUT asked for more than its limits; None up to a share of them."""
+def _clipped(outcomes: Sequence[Outcome]) -> Iterator[str]:
+    """Yield in how many steps a VUT asked for more than its limits, if that is often."""
     clipped = sum(outcome.measures.clipped_steps for outcome in outcomes)
     steps = sum(round(outcome.measures.t_end_s / DT_S) for outcome in outcomes)
-    if clipped <= share * steps:
-        return None
-    scenario = outcomes[0].case.scenario
-    return (
-        f"in {clipped} of {steps} steps the VUT asks for an acceleration outside "
-        f"{scenario.a_min_mps2:g} to {scenario.a_max_mps2:g} m/s2, which is clipped"
-    )
+    if clipped > CLIPPED_SHARE * steps:
+        scenario = outcomes[0].case.scenario
+        yield (
+            f"not driven as asked: in {clipped} of {steps} steps the VUT asks for an acceleration "
+            f"outside {scenario.a_min_mps2:g} to {scenario.a_max_mps2:g} m/s2, which is clipped; "
+            "check the unit and the sign of its answers"
+        )

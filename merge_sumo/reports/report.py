@@ -30,7 +30,7 @@ from merge_sumo.metrics.cause import BRAKED_MPS, MEANINGS
 from merge_sumo.metrics.fmc import radius_for
 from merge_sumo.metrics.merge import meanings
 from merge_sumo.metrics.outcome import Outcome
-from merge_sumo.metrics.plausibility import doubts, mostly_clipped
+from merge_sumo.metrics.plausibility import doubts
 from merge_sumo.reports.comparison_page import AGAINST_PAGE, write_against
 from merge_sumo.reports.facts import ERRORS, FAILURES, STARTS_THAT_FAIL, TIMEOUTS, by_level
 from merge_sumo.reports.pages import page
@@ -79,10 +79,6 @@ def report_page(model: ReportModel, *, running: bool = False) -> str:
         >>> html = report_page(ReportModel(ms.open_run("runs/latest").recorded, learns=False))
     """
     run = model.run
-    warnings = []
-    for warning in (unrepeatable(read_second_runs(run)), mostly_clipped(run.cases)):
-        if warning is not None:
-            warnings.append(warning)
     notes = doubts(run.cases, run.settings.in_vain)
     if run.settings.ran_again:
         notes.append(run.ran_again_in_words)
@@ -98,7 +94,7 @@ def report_page(model: ReportModel, *, running: bool = False) -> str:
         data=Markup(data),  # noqa: S704 (JSON without "<")
         # Of this campaign.
         model=model,
-        warnings=warnings,
+        warning=unrepeatable(read_second_runs(run)),
         notes=notes,
         go_on=campaign_command("resume", run.folder, run.record),
         printed=end_of(run.folder / LOG),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -118,6 +119,18 @@ class TestParsing:
 
 
 class TestMeasures:
+    @pytest.mark.parametrize(
+        ("text", "needs"),
+        [
+            ("lane_share > 0.9", "an acceleration lane"),
+            ("after_gap_m < 0", "a follow-up"),
+            ('nearest == "pov"', "traffic"),
+        ],
+    )
+    def test_that_a_scenario_does_not_have_are_refused(self, text, needs):
+        with pytest.raises(UserError, match=f"needs {needs}: choose another scenario than us23"):
+            Criterion(text).check(replace(US23, follow_up_s=0.0))
+
     def test_every_name_has_a_value_in_every_episode(self):
         for end in (End.MERGED, End.TIMEOUT):
             for name, choices in vocabulary().items():
