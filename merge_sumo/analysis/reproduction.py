@@ -130,11 +130,11 @@ class PredictedMargins:
     Attributes:
         margin: predicted margins on a regular grid, (n, n), rows along v_POV0, columns along
             x_POV0.
-        learned: the cases from which the surrogate has learned.
+        learned: the cases from which the surrogate has learned, in the unit square, (m, 2).
     """
 
     margin: FloatArray
-    learned: Panel
+    learned: FloatArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -184,7 +184,7 @@ class ColumnResult:
                 sampler.tell(known)
                 margin = predicted_margin(sampler.history(level), points)
                 square = margin.reshape(SURFACE_POINTS, SURFACE_POINTS)
-                result[batch] = PredictedMargins(square, _panel(known, level))
+                result[batch] = PredictedMargins(square, _panel(known, level).points)
         return result
 
 

@@ -48,14 +48,12 @@ class Rung(Record, frozen=True):
     Attributes:
         name: short name, as "lag-0.2".
         about: the change, in a phrase.
-        source: source of its number; empty for none.
         runs: the verdicts that flip, run by run: several where the change is drawn at random.
         skipped: reason why it was not run, in a clause; empty where it was.
     """
 
     name: str
     about: str
-    source: str = ""
     runs: tuple[Flips, ...] = ()
     skipped: str = ""
 
@@ -118,6 +116,7 @@ STRESS = StudyFile("stress.json", StressResult)
 PART_S = 0.02
 """Step of the simulation on the rung `step`, in s; that of eq. (4) is longer."""
 LAGS_S = (0.2, 0.35, 0.5)
+"""Chosen; on lags of cruise control: Xiao, Darbha and Gao (2008)."""
 POWER_W_PER_KG = 34.0
 """Power over mass: above this a car is of class 3, the highest. UN GTR No. 15, Annex 1."""
 ERROR_X_M = 0.5
@@ -136,7 +135,6 @@ class Disturbance:
     Attributes:
         name: short name.
         about: the change, in a phrase.
-        source: source of its number.
         plan: returns the plan of the rung from that of the campaign; raises `UserError` where the
             rung cannot run.
         case: returns the case of the rung from one of the campaign and a random generator; None
@@ -145,7 +143,6 @@ class Disturbance:
 
     name: str
     about: str
-    source: str = ""
     plan: Callable[[SimulationPlan], SimulationPlan] = lambda plan: plan
     case: Callable[[Case, np.random.Generator], Case] | None = None
 
@@ -185,7 +182,6 @@ def _start_off(case: Case, rng: np.random.Generator) -> Case:
 
 
 UNCHANGED = "nothing"
-LAG_SOURCE = "chosen; lags of cruise control: Xiao, Darbha and Gao (2008)"
 RUNGS = (
     Disturbance(UNCHANGED, "nothing is changed"),
     Disturbance(
@@ -197,7 +193,6 @@ RUNGS = (
         Disturbance(
             f"lag-{lag_s:g}",
             f"the acceleration of the VUT lags by {lag_s:g} s",
-            LAG_SOURCE,
             partial(_with_actuator, lag_s=lag_s),
         )
         for lag_s in LAGS_S
@@ -205,13 +200,11 @@ RUNGS = (
     Disturbance(
         "power",
         f"the VUT has {POWER_W_PER_KG:g} W/kg: it accelerates by P / (m v) at most",
-        "UN GTR No. 15, Annex 1: lower limit of class 3",
         partial(_with_actuator, power_w_per_kg=POWER_W_PER_KG),
     ),
     Disturbance(
         "start",
         f"the POV starts within {ERROR_X_M:g} m and {ERROR_V_MPS:.2f} m/s of where it did",
-        "accuracy of a radar, Autoliv NB24G1V2, user's manual, 3.1",
         case=_start_off,
     ),
     Disturbance(
@@ -267,7 +260,7 @@ def _rung(study: RunStudy, tested: Sequence[Outcome], one: Disturbance) -> Rung:
             raise
         study.on_cases((one.draws - len(flips)) * len(tested))
         flips, skipped = [], str(error)
-    return Rung(one.name, one.about, one.source, tuple(flips), skipped)
+    return Rung(one.name, one.about, tuple(flips), skipped)
 
 
 def flips_of(tested: Sequence[Outcome], again: Sequence[tuple[bool, bool, bool]]) -> Flips:

@@ -231,7 +231,7 @@ def predicted_margins(
                 axes.contour(margin, [0.0], extent=extent, colors="white", linewidths=1.6)
             marks: Any = {"s": 2, "color": "#D55E00", "linewidths": 0, "alpha": 0.5}
             axes.scatter(*failing.T, **marks)
-            learned = _physical(predicted.learned.points, level)
+            learned = _physical(predicted.learned, level)
             marks = {"s": 9, "color": "white", "edgecolors": "black", "linewidths": 0.5}
             axes.scatter(*learned.T, **marks)
             axes.set_title(f"after batch {batch}: {len(learned)} cases")

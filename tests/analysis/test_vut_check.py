@@ -54,7 +54,7 @@ def test_of_a_good_vut_it_says_nothing_wrong_and_what_a_step_costs(check):
     [
         (
             "import random\ndef Vut(seen):\n    return random.random()\n",
-            "the same cases in another order",
+            "the same cases run again in another order",
         ),
         (
             CLASS.format(reset="pass", act="self.shared[0] += 1; return self.shared[0] % 7 * 0.1"),
