@@ -7,7 +7,7 @@ import io
 import json
 import stat
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +32,7 @@ from merge_sumo.result import Result
 from merge_sumo.scenario.case import FloatArray, Pool
 from merge_sumo.scenario.scenario import OWN, Scenario
 from merge_sumo.simulation.evaluate import evaluate
-from merge_sumo.simulation.plan import Engine, SimulationPlan
+from merge_sumo.simulation.plan import SimulationPlan
 from merge_sumo.workers import Workers
 
 TRUTH_CASES = {0: 10_000, 1: 10_000, 2: 20_000, OWN: 10_000}
@@ -115,8 +115,8 @@ def ground_truth(
 ) -> Truth:
     """Return the ground truth of a plan at a level, from the cache where it is kept.
 
-    A truth is only used while the files that the VUT loaded are the same. A plan for the kinematic
-    engine also takes a truth by SUMO. Memory grows by 40 bytes a case.
+    A truth is only used while the files that the VUT loaded are the same. Memory grows by 40 bytes
+    a case.
 
     Args:
         plan: how cases run.
@@ -160,7 +160,7 @@ def ground_truth(
 def known_truth(
     plan: SimulationPlan, level: int, cases: int, seed: int = 0, *, cache: Path | None = None
 ) -> Truth | None:
-    """Return a truth from the cache: one by SUMO, or else by the engine of the plan.
+    """Return a truth from the cache.
 
     Args:
         plan: how the cases would run.
@@ -170,15 +170,23 @@ def known_truth(
         cache: folder of the truths; None for that of the user.
 
     Returns:
-        The truth; None where the cache has none.
+        The truth; None where the file is missing or torn, has other shapes or belongs to another
+        key, where others can write the cache, and where a file that the VUT loaded has changed.
     """
+    path = truth_path(plan, level, cases, seed, cache=cache)
+    try:
+        check_private(path.parent)
+        data = read_arrays(path, "points", "margin", "in_sumo", "files", "of")
+        files = decode(str(data["files"]), dict[str, str | None])
+        unchanged = all(sha256_of(Path(name)) == sha256 for name, sha256 in files.items())
+    except (OSError, UserError):
+        return None
+    points, margin = data["points"], data["margin"]
     shape = cases, len(plan.scenario.dimensions(level))
-    for engine in (Engine.SUMO, plan.engine):
-        path = truth_path(replace(plan, engine=engine), level, cases, seed, cache=cache)
-        truth = _read(path, shape)
-        if truth is not None:
-            return truth
-    return None
+    has_shapes = points.shape == shape and margin.shape == shape[:1]
+    if not (unchanged and has_shapes and str(data["of"]) == path.stem):
+        return None
+    return Truth(points, margin, int(data["in_sumo"]))
 
 
 def truth_path(
@@ -202,26 +210,6 @@ def truth_path(
     }
     key = hashlib.sha256(json.dumps(record, sort_keys=True).encode()).hexdigest()[:24]
     return (cache or cache_folder()) / f"truth-{key}.npz"
-
-
-def _read(path: Path, shape: tuple[int, int]) -> Truth | None:
-    """Read a truth with points of a shape, (n, d).
-
-    It is None where the file is missing or torn, has other shapes or belongs to another key, where
-    others can write the cache, and where a file that the VUT loaded has changed.
-    """
-    try:
-        check_private(path.parent)
-        data = read_arrays(path, "points", "margin", "in_sumo", "files", "of")
-        files = decode(str(data["files"]), dict[str, str | None])
-        unchanged = all(sha256_of(Path(name)) == sha256 for name, sha256 in files.items())
-    except (OSError, UserError):
-        return None
-    points, margin = data["points"], data["margin"]
-    has_shapes = points.shape == shape and margin.shape == shape[:1]
-    if not (unchanged and has_shapes and str(data["of"]) == path.stem):
-        return None
-    return Truth(points, margin, int(data["in_sumo"]))
 
 
 def _margin_of(episode: Episode) -> tuple[float, bool, Files]:

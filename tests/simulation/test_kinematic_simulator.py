@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from support.plans import POVS, plan_for
 
-from merge_sumo.analysis.truth import ground_truth, known_truth, truth_path
+from merge_sumo.analysis.truth import ground_truth, known_truth
 from merge_sumo.controllers.spec import ControllerOptions
 from merge_sumo.drivers.levelk import features
 from merge_sumo.drivers.policies import load_network
@@ -142,15 +142,15 @@ class TestATruth:
         np.testing.assert_allclose(ours.margin, sumos.margin, rtol=0.0, atol=1e-9)
         assert (ours.in_sumo, sumos.in_sumo) == (10, 1000)
 
-    def test_of_sumo_is_taken_and_not_the_other_way_round(self, tmp_path):
+    def test_is_kept_by_engine(self, tmp_path):
         counted: list[int] = []
         ground_truth(self.PLAN, 0, 50, cache=tmp_path, on_case=counted.append)
         ground_truth(plan_for("design2"), 0, 50, cache=tmp_path, on_case=counted.append)
         assert len(counted) == 100
-        truth_path(self.PLAN, 0, 50, cache=tmp_path).unlink()
-        kept = known_truth(self.PLAN, 0, 50, cache=tmp_path)
-        assert kept is not None
-        assert kept.in_sumo == 50
+        for plan, in_sumo in ((self.PLAN, 1), (plan_for("design2"), 50)):
+            kept = known_truth(plan, 0, 50, cache=tmp_path)
+            assert kept is not None
+            assert kept.in_sumo == in_sumo
 
 
 @pytest.mark.parametrize("name", ["pov1", "pov2", "vut1", "vut2"])
