@@ -143,7 +143,7 @@ def run_program(
             env=sumo_environment(),
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
-            stderr=None if limit_s is None else subprocess.PIPE,
+            stderr=subprocess.PIPE,
             text=True,
             errors="replace",
             timeout=limit_s,

@@ -171,8 +171,8 @@ def open_gui(folder: Path, from_s: float | None = None, *, silent: bool = False)
         for sentence in begins:
             notice(sentence)
     with stopping_in_order(), _staged(episode, first) as (stage, arguments):
-        if run_program("sumo-gui", arguments, stage, limit_s=None):
-            raise UserError("sumo-gui failed: it needs a desktop, or xvfb-run")
+        if reason := run_program("sumo-gui", arguments, stage, limit_s=None):
+            raise UserError(f"sumo-gui failed ({reason}): it needs a desktop, or xvfb-run")
 
 
 @dataclass(frozen=True, slots=True)
