@@ -117,6 +117,17 @@ class Coordinate:
         value: float | None = getattr(case, self.field)
         return value
 
+    def share(self, case: Any) -> float:
+        """Return the place of a case between the bounds.
+
+        Args:
+            case: a `Case`.
+
+        Returns:
+            0 at the lower bound, 1 at the upper bound; 0 for a case without a value.
+        """
+        return ((self.of(case) or self.low) - self.low) / (self.high - self.low)
+
     def text(self, case: Any) -> str:
         """Return the value of a case for a table.
 
