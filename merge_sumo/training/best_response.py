@@ -13,17 +13,22 @@ from numpy.typing import NDArray
 from merge_sumo.drivers.levelk import ACTIONS, LEVEL0_GAP_FEATURE, QNetwork
 from merge_sumo.scenario.case import FloatArray
 from merge_sumo.training.game import Game, IntArray
+from merge_sumo.training.reward import RewardParts
 
 SAME = 1e-2
 """States that differ by less, in m and m/s, count as one. Where the accelerations are multiples of
 0.2 m/s2, states lie on a lattice that is coarser."""
-MAX_STATES = 200_000
+MAX_STATES = 20_000
 """With more states, as on a long ramp without such a lattice, states that differ by twice as much
 count as one, and so on. No effect on the returns was seen up to 0.2 m and m/s."""
 
 
 def best_response(game: Game, state: FloatArray, known: FloatArray) -> FloatArray:
     """Search all paths against a level-0 opponent; of those to one state, only the best one.
+
+    The POVs of level 0 keep their speeds, so VUTs with one start have the same paths against all of
+    them. They are searched once, against a POV that begins at 0 m and drives 1 m/s. Its position is
+    the time, from which those of the POVs follow.
 
     Args:
         game: the game.
@@ -33,22 +38,43 @@ def best_response(game: Game, state: FloatArray, known: FloatArray) -> FloatArra
     Returns:
         The best returns, (n,).
     """
-    best = np.empty(len(state))
-    for case, start in enumerate(state):
-        best[case] = _best_of_all_paths(game, start, known[case])
+    clock = np.array([0.0, 1.0])
+    start, pov = state.copy(), np.broadcast_to(clock, (len(state), 2))
+    if game.role == "vut":
+        pov = state[:, :2]
+        start[:, :2] = clock
+    best = known.copy()
+    for searched in np.unique(start, axis=0):
+        cases = np.flatnonzero((start == searched).all(axis=1))
+        best[cases] = _best_of_all_paths(game, searched, pov[cases], known[cases])
     return best
 
 
-def _best_of_all_paths(game: Game, start: FloatArray, known: float) -> float:
-    """Return the best return from one start, (4,)."""
+def _best_of_all_paths(
+    game: Game, start: FloatArray, pov: FloatArray, known: FloatArray
+) -> FloatArray:
+    """Return the best returns of cases that have the same paths, (n,).
+
+    Args:
+        game: the game.
+        start: state at the start of the paths, (4,).
+        pov: where the POV of a path is at 0 m and drives 1 m/s, that of the case is at this
+            position and drives this speed, (n, 2); else in proportion.
+        known: returns that are known to be reached, (n,).
+    """
     own = slice(0, 2) if game.role == "pov" else slice(2, 4)
-    best, same = known, SAME
+    best, same = known.copy(), SAME
     state, so_far = start[None], np.zeros(1)
     for _ in range(game.max_decisions):
-        state, so_far, over = _continued(game, state, np.zeros(len(state)), so_far)
-        best = max(best, so_far[over].max(initial=-np.inf))
+        state, parts, over = _continued(game, state, np.zeros(len(state)))
+        so_far = np.repeat(so_far, ACTIONS)
+        so_far += parts.pov_ego if game.role == "pov" else parts.vut_ego
+        x_pov, v_pov, x_vut, v_vut = state[over].T
+        for case, (x_m, v_mps) in enumerate(pov):
+            safe = game.reward.safety(x_m + v_mps * x_pov - x_vut, v_mps * v_pov - v_vut)
+            best[case] = (so_far[over] + safe).max(initial=best[case])
         # The rest of a game wins at most the reward of a full gap.
-        alive = np.flatnonzero(~over & (so_far + game.reward.weights.gap > best))
+        alive = np.flatnonzero(~over & (so_far + game.reward.weights.gap > best.min()))
         kept = _best_of_each(state[alive, own], so_far[alive], same)
         while len(kept) > MAX_STATES:
             same *= 2.0
@@ -58,23 +84,21 @@ def _best_of_all_paths(game: Game, start: FloatArray, known: float) -> float:
 
 
 def _continued(
-    game: Game, state: FloatArray, svo_rad: FloatArray, so_far: FloatArray
-) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
+    game: Game, state: FloatArray, svo_rad: FloatArray
+) -> tuple[FloatArray, RewardParts, NDArray[np.bool_]]:
     """Continue paths by one decision, each by all actions in turn.
 
     Args:
         game: the game.
         state: last states of the paths, (n, 4).
         svo_rad: psi of the POV, (n,).
-        so_far: their returns so far, (n,).
 
     Returns:
-        The states and returns of the 7 n longer paths, and whether their games are over.
+        The states of the 7 n longer paths, the parts of the rewards of the decision, and whether
+        their games are over.
     """
     a_mps2 = np.tile(game.actions_mps2, len(state))
-    state, svo_rad = np.repeat(state, ACTIONS, axis=0), np.repeat(svo_rad, ACTIONS)
-    state, reward, over = game.advance(state, svo_rad, a_mps2)
-    return state, np.repeat(so_far, ACTIONS) + reward, over
+    return game.decide(np.repeat(state, ACTIONS, axis=0), np.repeat(svo_rad, ACTIONS), a_mps2)
 
 
 def _best_of_each(own: FloatArray, so_far: FloatArray, same: float) -> IntArray:
@@ -117,8 +141,9 @@ def beam_search(
     for decision in range(game.max_decisions):
         plan = np.repeat(plan, ACTIONS, axis=0)
         plan[:, decision] = np.tile(np.arange(ACTIONS), len(state))
-        state, so_far, over = _continued(game, state, svo_rad[cases], so_far)
-        cases = np.repeat(cases, ACTIONS)
+        state, parts, over = _continued(game, state, svo_rad[cases])
+        cases, so_far = np.repeat(cases, ACTIONS), np.repeat(so_far, ACTIONS)
+        so_far += parts.of(game.role, svo_rad[cases])
         ended = np.flatnonzero(over)
         # In rising order, so that the best of a case is written last.
         ended = ended[np.argsort(so_far[ended], kind="stable")]
