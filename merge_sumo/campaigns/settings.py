@@ -40,7 +40,7 @@ from merge_sumo.scenario.scenario import (
     level_name,
 )
 from merge_sumo.simulation.plan import SimulationPlan
-from merge_sumo.simulation.povs import POLICIES, Povs, own_pov, policies_folder
+from merge_sumo.simulation.povs import POLICIES, Povs, check_level, own_pov, policies_folder
 
 DEBUG_DEADLINE_S = 86_400.0
 """Deadline of a step while a user debugs."""
@@ -217,7 +217,7 @@ class CampaignSettings(Search):
         own = None if self.pov is None else own_pov(self.pov, options)
         povs = Povs(policies=policies, own=own)
         for level in self.levels:
-            povs.check_level(level)
+            check_level(level, povs.levels, policies)
         return SimulationPlan(
             scenario=self.scenario,
             road=road_for(self.scenario),

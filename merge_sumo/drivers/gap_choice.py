@@ -11,7 +11,6 @@ from merge_sumo.drivers.acceleration_lane import stopping_mps
 from merge_sumo.drivers.base import MERGE, NO_REQUEST, STAY, BuiltInVut, Design, Scene
 from merge_sumo.drivers.car_following import acc_mps2, car_ahead
 from merge_sumo.drivers.level0 import Level0Vut
-from merge_sumo.errors import UserError
 from merge_sumo.scenario.case import Case, FloatArray
 from merge_sumo.scenario.scenario import BEHIND, DT_S, VUT
 
@@ -30,11 +29,6 @@ class GapChoiceDesign(Design):
 
     headway_s: float = 0.8
     brake_mps2: float = 3.0
-
-    def __post_init__(self) -> None:
-        Design.__post_init__(self)
-        if self.brake_mps2 == 0.0:
-            raise UserError("brake_mps2 is 0: choose a number above 0, so that the VUT stops")
 
 
 DESIGN = GapChoiceDesign()

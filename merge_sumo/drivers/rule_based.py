@@ -8,7 +8,6 @@ import numpy as np
 
 from merge_sumo.drivers.base import BuiltInVut, Design, Scene
 from merge_sumo.drivers.level0 import Level0Vut, level0_time_to
-from merge_sumo.errors import UserError
 from merge_sumo.scenario.case import Case, FloatArray
 from merge_sumo.scenario.scenario import DT_S
 
@@ -19,7 +18,7 @@ class RuleBasedDesign(Design):
 
     Attributes:
         x1_m: distance before M at which stage 2 begins.
-        x2_m: distance before M at which stage 3 begins.
+        x2_m: distance before M at which stage 3 begins; beyond `x1_m`, with stage 2.
         gap_m: a predicted |dx| at M below this is "too close".
         target_m: the dx at M that the PID of stage 3 aims at; positive, so the VUT yields.
         kp: proportional gain, m/s2 per m of gap error.
@@ -36,11 +35,6 @@ class RuleBasedDesign(Design):
     ki: float = 0.0
     kd: float = 0.0
     lag_s: float = 0.0
-
-    def __post_init__(self) -> None:
-        Design.__post_init__(self)
-        if self.x2_m > self.x1_m:
-            raise UserError(f"x2_m is {self.x2_m}: stage 3 cannot begin before stage 2 (x1_m)")
 
 
 DESIGNS = {

@@ -148,9 +148,7 @@ def open_simulators(plan: SimulationPlan, workers: Workers) -> None:
     """
 
     def died(_: None) -> None:
-        own = plan.povs.own
-        pov = "" if own is None else f" or the POV {own.spec}"
-        raise UserError(f"opening the VUT {plan.vut.spec}{pov} ended its process: look into it")
+        raise UserError(f"opening the VUT {plan.vut.spec} or the POV ended its process")
 
     workers.collect(workers.submit(partial(_open_simulators, plan), [None], died))
 

@@ -123,8 +123,7 @@ class KinematicSimulator(Simulator):
         case = kinematic.case
         raise UserError(
             f"the case {described(case)} at level {case.level} ends otherwise in SUMO "
-            f"({_end_of(sumo)}) than by the equations of motion alone ({_end_of(kinematic)}): "
-            "choose `engine` sumo"
+            "than by the equations of motion alone: choose `engine` sumo"
         )
 
 
@@ -139,9 +138,3 @@ def drawn(cases: Sequence[Case]) -> set[int]:
     seed = zlib.crc32(repr((cases[0].level, cases[0].starts())).encode())
     count = math.ceil(CHECKED_SHARE * len(cases))
     return set(np.random.default_rng(seed).choice(len(cases), count, replace=False).tolist())
-
-
-def _end_of(trajectory: Trajectory) -> str:
-    """Return how an episode ended, in short."""
-    x_m = ", ".join(f"{x:.6f}" for x in trajectory.motion[-1, :, 0].tolist())
-    return f"{trajectory.end} after {trajectory.t_end_s} s at {x_m} m"

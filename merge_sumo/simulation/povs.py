@@ -55,10 +55,6 @@ class Povs:
         """The levels for which there is a POV; level 0 needs no policy."""
         return levels_in(self.policies, own=self.own is not None)
 
-    def check_level(self, level: int) -> None:
-        """Raise `UserError` where there is no POV of a level."""
-        check_level(level, self.levels, self.policies)
-
     def sha256(self) -> dict[str, str]:
         """Return the hashes of the policies by name."""
         return policies_sha256(self.policies)
@@ -138,11 +134,9 @@ def check_level(level: int, available: Collection[int], policies: Path) -> None:
     """
     if level in available:
         return
-    if level == OWN:
-        raise UserError("`level` own is a POV that you bring: name it with `pov`")
     if level in POLICIES:
         raise UserError(f"there is no policy for a POV of level {level}{how_to_train(policies)}")
-    raise UserError(f"there is no POV level {level}: choose {CHOICE}")
+    raise UserError(f"there is no POV level {level_name(level)}: choose {CHOICE}")
 
 
 def one_level(text: str, policies: Path, *, own: bool) -> int:
@@ -199,22 +193,20 @@ class PovLibrary(Driver):
             else:
                 self._drivers[OWN] = PovAdapter(driver)
         self._level = np.zeros(corridors, dtype=np.int64)
-        self._plays = {0: np.ones(corridors, dtype=bool)}
-        """Which corridors have a POV of a level."""
 
     def begin(self, corridor: int, case: Case) -> None:
         """Take the level of a case; KeyError when it has no policy."""
         self._drivers[case.level].begin(corridor, case)
-        if self._level[corridor] != case.level:
-            self._level[corridor] = case.level
-            self._plays = {level: self._level == level for level in np.unique(self._level).tolist()}
+        self._level[corridor] = case.level
 
     def act(self, scene: Scene) -> FloatArray:
         """Return the answer of the driver of each corridor, (K,)."""
         acceleration = np.zeros(self.corridors)
-        for level, plays in self._plays.items():
-            of_level = scene._replace(active=scene.active & plays)
-            np.copyto(acceleration, self._drivers[level].act(of_level), where=plays)
+        for level, driver in self._drivers.items():
+            plays = self._level == level
+            if plays.any():
+                of_level = scene._replace(active=scene.active & plays)
+                np.copyto(acceleration, driver.act(of_level), where=plays)
         return acceleration
 
     def reason(self, corridor: int) -> str | None:

@@ -81,7 +81,6 @@ def test_a_python_controller_takes_keywords_and_attributes(file, named, expected
         ("{}:Vut?gain=fast", "gain is 'fast': give a number"),
         ("gap?headway=1", "it has no parameter 'headway': choose from brake_mps2, headway_s"),
         ("gap?headway_s=-1", "headway_s is -1.0: it must be a number from 0 up"),
-        ("design2?x2_m=140", "x2_m is 140.0: stage 3 cannot begin before stage 2"),
         ("level1?x=1", "it has no parameter 'x': it has none"),
         ("sumo:IDM?taw=1", "it has no parameter 'taw': choose from accel,"),
         ("sumo:IDM?tau=-1", "tau is -1: give a number from 0 up"),

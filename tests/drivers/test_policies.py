@@ -17,7 +17,6 @@ from merge_sumo.drivers.levelk import (
     features,
 )
 from merge_sumo.drivers.policies import (
-    HUMAN,
     NETWORKS,
     load_network,
     plays_as,
@@ -52,16 +51,16 @@ def uniform_cases(level, count, seed=0):
     return from_unit(points, level, scenario=US23)
 
 
-@pytest.mark.parametrize("name", ["us23", HUMAN, "roundabout"])
+@pytest.mark.parametrize("name", ["us23", "human", "roundabout"])
 def test_a_shipped_library_is_complete_and_its_manifest_says_how_it_was_made(name):
-    folder = policies_in(name) if name == HUMAN else policies_of(named_scenario(name))
-    scenario = US23 if name == HUMAN else named_scenario(name)
+    folder = policies_in(name) if name == "human" else policies_of(named_scenario(name))
+    scenario = US23 if name == "human" else named_scenario(name)
     manifest = read_manifest(folder)
     assert tuple(manifest) == NETWORKS
     weights = dataclasses.asdict(RewardWeights.of(scenario))
     for network_name, entry in manifest.items():
         network = load_network(network_name, folder)
-        limited = name == HUMAN and network_name.startswith("pov")
+        limited = name == "human" and network_name.startswith("pov")
         assert network.sees_svo == (network_name == "pov2")
         assert network.a_min_mps2 == entry.get("a_min_mps2") == (-2.0 if limited else None)
         assert entry["command"].startswith(f"merge-sumo train --only {network_name} ")

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from support.plans import POVS, plan_for
 
-from merge_sumo.drivers.policies import HUMAN, policies_in, policies_of
+from merge_sumo.drivers.policies import policies_in, policies_of
 from merge_sumo.metrics.criterion import Criterion
 from merge_sumo.metrics.outcome import Outcome, Prediction
 from merge_sumo.records import decode, to_plain
@@ -56,7 +56,7 @@ class TestRollouts:
         [
             *(("us23", level, None) for level in (0, 1, 2)),
             *(("us23-traffic", 1, None), ("roundabout", 2, None)),
-            *(("us23", level, HUMAN) for level in (1, 2)),
+            *(("us23", level, "human") for level in (1, 2)),
         ],
     )
     def test_end_as_sumo_ends_them(self, name, level, library, tmp_path):

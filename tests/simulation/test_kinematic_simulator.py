@@ -161,8 +161,6 @@ def test_greedy_actions_of_many_rows_are_those_of_one_row(name):
     svo_rad = rng.uniform(0.0, 1.5, n) if network.sees_svo else None
     inputs = features(state, svo_rad, scenario=US23)
     inputs[7] = np.inf
-    values = network.values(inputs)
-    expected = np.where(np.isfinite(values).all(axis=1), values.argmax(axis=1), -1)
-    assert expected[7] == -1
-    assert network.greedy(inputs).tolist() == expected.tolist()
-    assert network.greedy(inputs[:39]).tolist() == expected[:39].tolist()
+    actions = network.greedy(inputs).tolist()
+    assert [row for row, action in enumerate(actions) if action == -1] == [7]
+    assert [network.greedy(inputs[[row]]).item() for row in range(39)] == actions[:39]

@@ -36,7 +36,7 @@ def test_are_read_in_their_order(asked, own, levels):
         ("0,3", False, "there is no POV level '3': choose 0, 1, 2, all, or own"),
         ([], False, "there is no POV level ''"),
         ("0,all", False, "there is no POV level 'all'"),
-        ("0,own", False, "`level` own is a POV that you bring"),
+        ("0,own", False, "there is no POV level own: choose 0, 1, 2, all, or own with `pov`"),
         ("1,0", True, "`pov` drives at `level` own or all, not at `level` 1,0"),
     ],
 )

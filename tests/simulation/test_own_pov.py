@@ -150,7 +150,10 @@ class TestACampaign:
     @pytest.mark.parametrize(
         ("arguments", "said"),
         [
-            (("--level", "own"), "--level own is a POV that you bring: name it with --pov"),
+            (
+                ("--level", "own"),
+                "no POV level own: choose 0, 1, 2, all, or own with --pov",
+            ),
             (("--pov", "traci"), "a TraCI client drives the vehicle named vut and no other"),
             (("--pov", "level1"), "the POVs of levels 0 to 2 need no name"),
             (("--pov", "nowhere.py:Pov"), "the POV nowhere.py:Pov: cannot"),
