@@ -4,7 +4,7 @@ from importlib.util import find_spec
 
 from merge_sumo.errors import UserError
 
-for _package in ("torch", "gymnasium"):
+for _package in ("torch", "gymnasium", "pygame"):
     if find_spec(_package) is None:
         raise UserError(
             f"training needs {_package}, which is not installed: run "

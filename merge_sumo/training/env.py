@@ -23,14 +23,15 @@ from merge_sumo.drivers.levelk import ACTIONS, DECISION_STEPS
 from merge_sumo.drivers.policies import load_network
 from merge_sumo.errors import UserError
 from merge_sumo.scenario.case import FloatArray
-from merge_sumo.scenario.scenario import DT_S, SVO, US23, Scenario, Units
+from merge_sumo.scenario.scenario import DT_S, SVO, US23, Scenario
 from merge_sumo.training.game import Game, of_two, pool_starts
 from merge_sumo.training.picture import GamePicture
 from merge_sumo.training.reward import Reward, RewardWeights, Role
 
-STATE_LOW = np.array([-500.0, 0.0, -200.0, 0.0])
-STATE_HIGH = np.array([1900.0, 100.0, 30.0, 100.0])
-"""Bounds of an observation, in the units of the scenario."""
+BOUND = 10_000.0
+"""Bound of an observation: far beyond where any vehicle comes in a game."""
+OPPONENTS = {"pov": ("level0", "vut1", "vut2"), "vut": ("level0", "pov1", "pov2")}
+"""Opponents by the role of the agent."""
 FPS = round(1.0 / (DECISION_STEPS * DT_S))
 """A picture for each decision shows a game in real time."""
 
@@ -76,29 +77,22 @@ class MergeEnv(gymnasium.Env[FloatArray, np.int64]):
         Raises:
             UserError: if these do not make a game.
         """
-        others = {"pov": "vut", "vut": "pov"}
-        if role not in others:
-            raise UserError(f"unknown role {role!r}: choose pov or vut")
-        if opponent != "level0" and not opponent.startswith(others[role]):
+        if opponent not in OPPONENTS.get(role, ()):
             raise UserError(
-                f"a {role} cannot play against {opponent!r}: choose level0 or a {others[role]}"
+                f"a {role} cannot play against {opponent!r}: `role` is pov or vut, and `opponent` "
+                "is level0 or a policy of the other one, such as vut1"
             )
-        if role == "vut" and svo is not None:
-            raise UserError("svo is the orientation of a POV: leave it out for role='vut'")
         is_psi = isinstance(svo, int | float) and SVO.low <= svo < SVO.high
-        if not (svo is None or svo == "random" or is_psi):
-            raise UserError(f"svo is {svo!r}: choose 'random', or 0 up to, and below, pi/2")
+        if svo is not None and (role == "vut" or not (svo == "random" or is_psi)):
+            raise UserError(
+                f"svo is {svo!r}: choose 'random', or 0 up to, and below, pi/2, for a POV"
+            )
         network = None if opponent == "level0" else load_network(opponent)
         reward = Reward(weights or RewardWeights.of(scenario), of_two(scenario))
         self.game = Game(role, network, reward)
         self.svo, self.render_mode = svo, render_mode
-        unit = Units.of(scenario)
-        units = np.array([unit.length, unit.speed, unit.length, unit.speed])
-        low, high = STATE_LOW * units, STATE_HIGH * units
-        if svo is not None:
-            low, high = np.append(low, SVO.low), np.append(high, SVO.high)
-        self._bounds = low, high
-        self.observation_space = spaces.Box(low, high, dtype=np.float64)
+        observed = 4 if svo is None else 5
+        self.observation_space = spaces.Box(-BOUND, BOUND, (observed,), np.float64)
         self.action_space = spaces.Discrete(ACTIONS)
         self._state, self._svo_rad, self._decisions = np.zeros((1, 4)), np.zeros(1), 0
         self._picture = None
@@ -157,4 +151,4 @@ class MergeEnv(gymnasium.Env[FloatArray, np.int64]):
         state = self._state[0]
         if self.svo is not None:
             state = np.append(state, self._svo_rad)
-        return np.asarray(np.clip(state, *self._bounds))
+        return np.asarray(state)

@@ -284,10 +284,16 @@ def test_a_limit_outside_that_of_the_scenario_is_refused(tmp_path, a_min_mps2):
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (("--only", "pov2", "--out", "new"), "pov2 is trained against vut1: train that one first"),
+        (
+            ("--only", "pov2", "--out", "new"),
+            "unknown policy 'vut1' in new: run `merge-sumo train --out new`",
+        ),
         (("--only", "pov3"), "unknown network 'pov3': choose pov1, vut1, pov2, vut2"),
         (("--scenario", "roundabout"), "the shipped policies are for us23"),
-        (("--check", "--out", "none"), "none has no pov1: run `merge-sumo train`"),
+        (
+            ("--check", "--out", "none"),
+            "unknown policy 'pov1' in none: run `merge-sumo train --out none`",
+        ),
     ],
 )
 def test_a_training_that_cannot_be_is_refused(tmp_path, monkeypatch, words, said):
