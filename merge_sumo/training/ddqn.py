@@ -247,21 +247,21 @@ class _Games:
 def train(
     game: Game,
     seed: int,
-    settings: DdqnSettings | None = None,
-    on_progress: Callable[[TrainingProgress], None] = lambda _: None,
+    settings: DdqnSettings,
+    on_progress: Callable[[TrainingProgress], None],
 ) -> QNetwork:
     """Train the agent of a game; same seed, same weights.
 
     Args:
         game: the game.
         seed: seed of the weights and of the games.
-        settings: settings; by default those of the shipped policies.
+        settings: settings; their defaults are those of the shipped policies.
         on_progress: called after every thousand updates.
 
     Returns:
         The network of the agent.
     """
-    s = settings or DdqnSettings()
+    s = settings
     # One thread: the result must not depend on the number of cores.
     torch.set_num_threads(1)
     torch.manual_seed(seed)

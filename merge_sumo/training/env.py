@@ -25,8 +25,8 @@ from merge_sumo.errors import UserError
 from merge_sumo.scenario.case import FloatArray
 from merge_sumo.scenario.scenario import DT_S, SVO, US23, Scenario
 from merge_sumo.training.game import Game, of_two, pool_starts
-from merge_sumo.training.picture import GamePicture
-from merge_sumo.training.reward import Reward, RewardWeights, Role
+from merge_sumo.training.picture import game_picture
+from merge_sumo.training.reward import Reward, Role
 
 BOUND = 10_000.0
 """Bound of an observation: far beyond where any vehicle comes in a game."""
@@ -59,7 +59,6 @@ class MergeEnv(gymnasium.Env[FloatArray, np.int64]):
         role: Role = "pov",
         opponent: str = "level0",
         svo: float | Literal["random"] | None = None,
-        weights: RewardWeights | None = None,
         render_mode: str | None = None,
         scenario: Scenario = US23,
     ) -> None:
@@ -70,7 +69,6 @@ class MergeEnv(gymnasium.Env[FloatArray, np.int64]):
             opponent: "level0", or a policy such as "vut1" or "pov1".
             svo: psi of a POV of level 2, in rad, or "random" for one drawn for every game; psi is
                 then part of the observation.
-            weights: weights of the reward; by default those of the scenario.
             render_mode: "rgb_array" for pictures; `gymnasium.make` takes "human" for a window, too.
             scenario: the scenario that is played; its timeout truncates a game.
 
@@ -88,16 +86,12 @@ class MergeEnv(gymnasium.Env[FloatArray, np.int64]):
                 f"svo is {svo!r}: choose 'random', or 0 up to, and below, pi/2, for a POV"
             )
         network = None if opponent == "level0" else load_network(opponent)
-        reward = Reward(weights or RewardWeights.of(scenario), of_two(scenario))
-        self.game = Game(role, network, reward)
+        self.game = Game(role, network, Reward.of(of_two(scenario)))
         self.svo, self.render_mode = svo, render_mode
         observed = 4 if svo is None else 5
         self.observation_space = spaces.Box(-BOUND, BOUND, (observed,), np.float64)
         self.action_space = spaces.Discrete(ACTIONS)
         self._state, self._svo_rad, self._decisions = np.zeros((1, 4)), np.zeros(1), 0
-        self._picture = None
-        if render_mode == "rgb_array":
-            self._picture = GamePicture(self.game.scenario)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -145,7 +139,9 @@ class MergeEnv(gymnasium.Env[FloatArray, np.int64]):
 
     def render(self) -> NDArray[np.uint8] | None:
         """Return the picture of the game, (240, 960, 3), or None without a render mode."""
-        return None if self._picture is None else self._picture.frame(self._state[0])
+        if self.render_mode is None:
+            return None
+        return game_picture(self.game.scenario, self._state[0])
 
     def _observed(self) -> FloatArray:
         state = self._state[0]

@@ -251,7 +251,7 @@ def _starting_speeds(n: int, rng: np.random.Generator, scenario: Scenario) -> Fl
 
 
 def exploring_starts(
-    n: int, rng: np.random.Generator, midway: float = 0.6, *, scenario: Scenario
+    n: int, rng: np.random.Generator, midway: float, *, scenario: Scenario
 ) -> FloatArray:
     """Draw starting states: a share from mid-way in a game, the rest from the pool.
 

@@ -25,60 +25,43 @@ MARGINS_M = (50.0, 22.5)
 """Least width and height of the shown road, without the distance between the cars."""
 
 
-class GamePicture:
-    """Draws states of a merging game on the road of its scenario.
+def game_picture(scenario: Scenario, state: FloatArray) -> NDArray[np.uint8]:
+    """Draw a state of a merging game on the road of its scenario.
 
-    Example:
-        picture = GamePicture(US23)
-        pixels = picture.frame(np.array([-250.0, 30.0, -182.0, 18.0]))
+    Both cars are shown, the POV on the main road and the VUT on the ramp.
+
+    Args:
+        scenario: the scenario of the game.
+        state: x_POV, v_POV, x_VUT and v_VUT, (4,), in m and m/s.
+
+    Returns:
+        Red, green and blue of each pixel, (240, 960, 3).
     """
+    # Imported here: pygame greets in the terminal.
+    pygame: Any = importlib.import_module("pygame")
+    road = road_data(road_for(scenario))
+    pov_length_m, vut_length_m = scenario.lengths_m
+    x_pov_m, _, x_vut_m, _ = state
+    pov_ends_m = _points_at(road["main"], x_pov_m - pov_length_m, x_pov_m)
+    vut_ends_m = _points_at(road["ramp"], x_vut_m - vut_length_m, x_vut_m)
+    _, pov_front_m = pov_ends_m
+    _, vut_front_m = vut_ends_m
+    shown_m = np.abs(pov_front_m - vut_front_m) + MARGINS_M
+    centre_m = (pov_front_m + vut_front_m) / 2.0
+    px_per_m = (SIZE_PX / shown_m).min()
+    lines = [(ROAD, np.array(lane), LANE_M) for lane in road["lanes"]]
+    lines += (COLOURS["pov"], pov_ends_m, CAR_M), (COLOURS["vut"], vut_ends_m, CAR_M)
+    surface = pygame.Surface(SIZE_PX)
+    surface.fill("#ffffff")
+    for colour, points_m, width_m in lines:
+        # y points up, and pixels count from the upper left corner.
+        points_px = SIZE_PX / 2.0 + (points_m - centre_m) * px_per_m * [1.0, -1.0]
+        pygame.draw.lines(surface, colour, False, points_px, math.ceil(width_m * px_per_m))
+    # pygame's arrays have the columns first: (width, height, 3).
+    return np.ascontiguousarray(pygame.surfarray.array3d(surface).transpose(1, 0, 2))
 
-    def __init__(self, scenario: Scenario) -> None:
-        """Load the road of a scenario.
 
-        Args:
-            scenario: the scenario of the game.
-        """
-        # Imported here: pygame greets in the terminal.
-        self._pygame: Any = importlib.import_module("pygame")
-        self._road = road_data(road_for(scenario))
-        self._lengths_m = scenario.lengths_m
-
-    def frame(self, state: FloatArray) -> NDArray[np.uint8]:
-        """Draw one state.
-
-        Args:
-            state: x_POV, v_POV, x_VUT and v_VUT, (4,), in m and m/s.
-
-        Returns:
-            Red, green and blue of each pixel, (240, 960, 3).
-        """
-        x_pov_m, _, x_vut_m, _ = state
-        pov_length_m, vut_length_m = self._lengths_m
-        pov_ends_m = self._ends_of_car("main", x_pov_m - pov_length_m, x_pov_m)
-        vut_ends_m = self._ends_of_car("ramp", x_vut_m - vut_length_m, x_vut_m)
-        # Both cars are shown; y points up, and pixels count from the upper left corner.
-        _, pov_front_m = pov_ends_m
-        _, vut_front_m = vut_ends_m
-        shown_m = np.abs(pov_front_m - vut_front_m) + MARGINS_M
-        centre_m = (pov_front_m + vut_front_m) / 2.0
-        px_per_m = (SIZE_PX / shown_m).min()
-        lines = [(ROAD, np.array(lane), LANE_M) for lane in self._road["lanes"]]
-        lines += (COLOURS["pov"], pov_ends_m, CAR_M), (COLOURS["vut"], vut_ends_m, CAR_M)
-        surface = self._pygame.Surface(SIZE_PX)
-        surface.fill("#ffffff")
-        for colour, points_m, width_m in lines:
-            points_px = SIZE_PX / 2.0 + (points_m - centre_m) * px_per_m * [1.0, -1.0]
-            width_px = math.ceil(width_m * px_per_m)
-            self._pygame.draw.lines(surface, colour, False, points_px, width_px)
-        # pygame's arrays have the columns first: (width, height, 3).
-        columns = self._pygame.surfarray.array3d(surface)
-        return np.ascontiguousarray(columns.transpose(1, 0, 2))
-
-    def _ends_of_car(self, path: str, rear_m: float, front_m: float) -> FloatArray:
-        """Return the points of the rear and the front of a car on a path of the road, (2, 2)."""
-        along_m, x_m, y_m = np.array(self._road[path]).T
-        ends_m = rear_m, front_m
-        x_ends_m = np.interp(ends_m, along_m, x_m)
-        y_ends_m = np.interp(ends_m, along_m, y_m)
-        return np.column_stack([x_ends_m, y_ends_m])
+def _points_at(path: Any, *places_m: float) -> FloatArray:
+    """Return the points at places along a path of the road, (n, 2)."""
+    along_m, x_m, y_m = np.array(path).T
+    return np.column_stack([np.interp(places_m, along_m, x_m), np.interp(places_m, along_m, y_m)])

@@ -110,8 +110,8 @@ def refine(
     game: Game,
     network: QNetwork,
     seed: int,
-    settings: RefineSettings | None = None,
-    on_progress: Callable[[TrainingProgress], None] = lambda _: None,
+    settings: RefineSettings,
+    on_progress: Callable[[TrainingProgress], None],
 ) -> QNetwork:
     """Refine a network for its game; same seed, same weights.
 
@@ -119,13 +119,13 @@ def refine(
         game: the game.
         network: a network that `ddqn.train` has trained for it.
         seed: seed of starts, exploration and batches.
-        settings: settings; by default those of level 1.
+        settings: settings; their defaults are those of level 1.
         on_progress: called after every round.
 
     Returns:
         The refined network.
     """
-    s = settings or RefineSettings()
+    s = settings
     rng = np.random.default_rng([seed, 1])
     learner = Learner(as_torch(network))
     rounds: list[tuple[np.ndarray, np.ndarray]] = []

@@ -86,7 +86,7 @@ def test_the_tutorial_shows_the_code_that_its_commands_run():
 
 def trained(seed):
     game = Game("pov", None, REWARD)
-    return ddqn.train(game, seed, dataclasses.replace(TINY, updates=200))
+    return ddqn.train(game, seed, dataclasses.replace(TINY, updates=200), lambda _: None)
 
 
 def unrefined():
@@ -95,7 +95,7 @@ def unrefined():
 
 
 def refined(seed, settings=QUICK):
-    return refine.refine(Game("pov", None, REWARD), unrefined(), seed, settings)
+    return refine.refine(Game("pov", None, REWARD), unrefined(), seed, settings, lambda _: None)
 
 
 @pytest.mark.slow
