@@ -282,14 +282,11 @@ class PolicyChecks(Result, dict[str, PolicyCheck]):
 
     def lines(self) -> list[str]:
         """Return a table of the checks."""
-        lines = [
-            "network  mean regret  p99 regret  collisions  avoidable  mean return  best  level 0"
-        ]
+        lines = ["network  mean regret  p99 regret  collisions  avoidable"]
         for name, check in self.items():
             lines.append(
                 f"{name:<7}  {check.mean_regret:11.2%}  {check.p99_regret:10.2%}  "
-                f"{check.collisions:10d}  {check.avoidable_collisions:9d}  "
-                f"{check.mean_return:11.3f}  {check.mean_best:.3f}  {check.mean_level0:.3f}"
+                f"{check.collisions:10d}  {check.avoidable_collisions:9d}"
             )
         return lines
 
