@@ -49,8 +49,12 @@ def game_picture(scenario: Scenario, state: FloatArray) -> NDArray[np.uint8]:
     shown_m = np.abs(pov_front_m - vut_front_m) + MARGINS_M
     centre_m = (pov_front_m + vut_front_m) / 2.0
     px_per_m = (SIZE_PX / shown_m).min()
-    lines = [(ROAD, np.array(lane), LANE_M) for lane in road["lanes"]]
-    lines += (COLOURS["pov"], pov_ends_m, CAR_M), (COLOURS["vut"], vut_ends_m, CAR_M)
+    lines = [
+        (ROAD, np.array(road["main"])[:, 1:], LANE_M),  # without the lane coordinate
+        (ROAD, np.array(road["ramp"])[:, 1:], LANE_M),
+        (COLOURS["pov"], pov_ends_m, CAR_M),
+        (COLOURS["vut"], vut_ends_m, CAR_M),
+    ]
     surface = pygame.Surface(SIZE_PX)
     surface.fill("#ffffff")
     for colour, points_m, width_m in lines:
