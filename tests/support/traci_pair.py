@@ -25,10 +25,10 @@ from merge_sumo.road.road import Road
 from merge_sumo.scenario.scenario import DT_S, US23, Scenario
 from merge_sumo.sumo.binding import sumo_environment, sumo_program
 from merge_sumo.sumo.mirror import (
-    COLOURS,
     DEPARTURE_SPEED_MODE,
     NET,
     OPTIONS,
+    RGBA,
     TYPES,
     MirrorSimulation,
     edges_of,
@@ -189,7 +189,7 @@ class Pair:
             place = {"departPos": str(point.position_m), "departSpeed": str(v_mps)}
             place["departLane"] = point.lane.rpartition("_")[2]
             vehicle.add(name, f"route.{name}", typeID=name, **place)
-            vehicle.setColor(name, COLOURS[name == "vut"])
+            vehicle.setColor(name, RGBA[name == "vut"])
             before_mps[name] = v_mps
         for step in range(steps):
             self.session.answered()
@@ -240,7 +240,7 @@ class Drive:
         self.real.simulationStep()
         vehicle.setSpeedMode("vut", DEPARTURE_SPEED_MODE)
         vehicle.setLaneChangeMode("vut", 0)
-        vehicle.setColor("vut", COLOURS[1])
+        vehicle.setColor("vut", RGBA[1])
         vehicle.setSpeed("vut", 18.0)
 
     def restart(self, pov: tuple[float, float] = (-250.0, 30.0)) -> None:
