@@ -24,7 +24,7 @@ from merge_sumo.controllers.controller import ControllerDriver, Start
 from merge_sumo.controllers.deadline import Deadline, text_of
 from merge_sumo.controllers.process import parent_connection
 from merge_sumo.controllers.spec import ControllerKind, ControllerOptions, ControllerSpec
-from merge_sumo.drivers.base import ControllerDiedError, Scene
+from merge_sumo.drivers.base import EpisodesLostError, Scene
 from merge_sumo.errors import ControllerError, UserError
 from merge_sumo.printable import printable
 from merge_sumo.scenario.signals import StepSignals
@@ -62,7 +62,8 @@ class HostReply(msgspec.Struct, omit_defaults=True):
         failed: why the request failed; "" where it did not.
         is_finding: whether the code of the controller failed to load.
         max_corridors: corridors that one driver can serve; None for any number.
-        files: files of code that were loaded; empty where they are those of the last reply.
+        files: all files of code that were loaded so far; empty if no module was loaded since the
+            last reply.
         parameters: present values of the parameters of the driver that was made.
         accelerations_mps2: answers of the driver, (K,).
         merge_requests: its merge requests, (K,); None where it made none.
@@ -130,7 +131,7 @@ class _Host:
         process = os.getpid()
         try:
             reply = action(request)
-        except (UserError, ControllerDiedError) as error:
+        except (UserError, EpisodesLostError) as error:
             failed = printable(str(error))  # names of files may not be valid text
             reply = HostReply(failed=failed, is_finding=isinstance(error, ControllerError))
         except Exception as error:

@@ -223,7 +223,7 @@ class Controller:
 
 
 class ControllerDriver(Driver):
-    """A driver that learns of an episode only its start, so that it can run in another process."""
+    """A driver that is told only the `Start` of an episode, so it can run in another process."""
 
     def __init__(self, corridors: int) -> None:
         """Prepare for corridors 0 to `corridors` - 1.
@@ -275,8 +275,9 @@ class ControllerArray(ControllerDriver):
     in words. In a child process `child_main._Host` sends both, and `hosted.HostedDriver` gives both
     to the parent. `Rollout.note_faults` finds the NaN, asks for the reason, and ends that episode
     alone as `End.VUT_ERROR`. The words are the `error` of the trajectory, of the outcome, and of
-    its line in `outcomes.jsonl`. The next episode in the corridor has a new controller. A crash of
-    the child process takes another way: see `HostedDriver`.
+    its line in `outcomes.jsonl`. The next episode in the corridor has a new controller. One that
+    itself answers NaN or infinity is not replaced, and has no reason: `Rollout.note_faults` writes
+    "answered nan". A crash of the child process takes another way: see `HostedDriver`.
     """
 
     def __init__(self, corridors: int, new: Callable[[], Controller], deadline_s: float) -> None:

@@ -46,7 +46,8 @@ class Deadline:
     Attributes:
         deadline_s: time for a call.
         before_call: called with the time in s before each call, in a process that hosts a
-            controller; None in others. In such a process an interrupt is the controller's own.
+            controller; None in others. There a KeyboardInterrupt comes from the controller, and is
+            its fault.
     """
 
     before_call: ClassVar[Callable[[float], None] | None] = None

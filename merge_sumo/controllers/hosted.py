@@ -18,7 +18,7 @@ from merge_sumo.controllers.child_main import HostReply, HostRequest, decode_rep
 from merge_sumo.controllers.controller import ControllerDriver, Start
 from merge_sumo.controllers.process import BROKEN, ChildProcess, ProcessDiedError
 from merge_sumo.controllers.spec import ControllerKind, ControllerOptions, ControllerSpec
-from merge_sumo.drivers.base import ControllerDiedError, Driver, Scene
+from merge_sumo.drivers.base import Driver, EpisodesLostError, Scene
 from merge_sumo.errors import ControllerError, UserError
 from merge_sumo.scenario.case import FloatArray
 from merge_sumo.scenario.signals import valid_signals
@@ -27,8 +27,8 @@ SUPPORTED = os.name == "posix"
 """Elsewhere a controller runs in this process."""
 GRACE_FACTOR = 1.5
 GRACE_S = 1.25
-"""A process that sends nothing for GRACE_FACTOR deadlines and GRACE_S seconds is killed: by then it
-should have ended the call by itself."""
+"""The child ends a late call itself. If it has sent nothing for GRACE_FACTOR deadlines and GRACE_S
+seconds, the parent kills it."""
 
 
 class ControllerProcess(ChildProcess):
@@ -182,7 +182,7 @@ class HostedKind(ControllerKind):
         return HostedDriver(corridors, self)
 
     def process(self, *, again: bool = True) -> ControllerProcess:
-        """Return the process in which the controller is loaded, or a new one.
+        """Hand over the process in which the controller is loaded, or start a new one.
 
         Args:
             again: whether it is started again if it dies, as it may have been killed from outside.
@@ -202,15 +202,18 @@ class HostedKind(ControllerKind):
 
     def release(self) -> None:
         """End a process that no driver has taken."""
+        if self._process is not None:
+            self._process.kill()
         self._process = None
 
 
 class HostedDriver(ControllerDriver):
     """Passes each step on to the child process of a controller.
 
-    A process that dies, or sends nothing in time, is a `ControllerDiedError`: `Rollout.begin_again`
-    runs the running episodes again, one at a time, each in a new process, so that a second death
-    has one case. The error of a call is a reason of the reply: `ControllerArray` says how it
+    A process that dies, or sends nothing in time, is an `EpisodesLostError`, and so is a request
+    that fails as a whole. `Rollout.begin_again` then runs the running episodes again, one at a
+    time, so that a second loss is of one case. A process that has ended is started again with the
+    next request. The error of a call is a reason of the reply: `ControllerArray` says how it
     travels.
     """
 
@@ -246,7 +249,8 @@ class HostedDriver(ControllerDriver):
             scene: the state of all corridors.
 
         Raises:
-            ControllerDiedError: if the process died, or cannot be started again after that.
+            EpisodesLostError: if the process died, cannot be started again after that, or could not
+                carry out the request.
         """
         request = HostRequest("act", starts=self._starts, scene=scene)
         self._starts = []
@@ -255,7 +259,7 @@ class HostedDriver(ControllerDriver):
                 self._process = self._opened()
             reply = self._process.request(request)
         except UserError as error:
-            raise ControllerDiedError(str(error)) from None
+            raise EpisodesLostError(str(error)) from None
         self._files.update(paths_of(reply))
         self._reasons, self._signals = reply.reasons, {}
         for corridor, left in reply.signals.items():
@@ -266,7 +270,7 @@ class HostedDriver(ControllerDriver):
         for column in (answers, merge_requests):
             if column is not None and len(column) != self.corridors:
                 self._process.kill()
-                raise ControllerDiedError(BROKEN)
+                raise EpisodesLostError(BROKEN)
         self._merge_requests = merge_requests
         return answers
 

@@ -37,7 +37,7 @@ from merge_sumo.controllers.signatures import (
     takes_seed,
 )
 from merge_sumo.controllers.spec import HERE, ControllerKind, ControllerSpec
-from merge_sumo.drivers.base import MERGE, NO_REQUEST, STAY, ControllerDiedError, Driver, Scene
+from merge_sumo.drivers.base import MERGE, NO_REQUEST, STAY, Driver, EpisodesLostError, Scene
 from merge_sumo.errors import ControllerError, UserError
 from merge_sumo.files import check_code
 from merge_sumo.registry import entries_of
@@ -347,7 +347,7 @@ class BatchedDriver(ControllerDriver):
             Accelerations, (K,), m/s2; NaN where there is a reason.
 
         Raises:
-            ControllerDiedError: if it fails and several episodes run: any may be at fault.
+            EpisodesLostError: if it fails and several episodes run: any may be at fault.
         """
         self._merge_requests, k = None, self.corridors
         seen = SeenBatch.of(scene, self._lanes_m)
@@ -365,7 +365,7 @@ class BatchedDriver(ControllerDriver):
             reason, self._replace = self._deadline.reason(error), True
             running = np.flatnonzero(scene.active).tolist()
             if len(running) > 1:
-                raise ControllerDiedError(reason) from None
+                raise EpisodesLostError(reason) from None
             self._reasons = dict.fromkeys(running, reason) | self._reasons
             return np.full(k, np.nan)
         answer = answer.astype(np.float64)

@@ -100,12 +100,15 @@ class Scene(NamedTuple):
         return Scene(active, step, x_m, v_mps, merged=merged)
 
 
-class ControllerDiedError(Exception):
-    """A driver has lost the state of its corridors: their episodes have to begin again."""
+class EpisodesLostError(Exception):
+    """The running episodes of a driver are lost, and have to begin again.
+
+    The process of its controllers has ended, or a call for several episodes at once has failed.
+    """
 
 
-class PovDiedError(ControllerDiedError):
-    """The driver of the POV has lost the state of its corridors."""
+class PovEpisodesLostError(EpisodesLostError):
+    """The running episodes of the driver of the POV are lost."""
 
 
 NO_REQUEST, STAY, MERGE = -1, 0, 1
@@ -154,7 +157,7 @@ class Driver(ABC):
             scene: the present state.
 
         Raises:
-            ControllerDiedError: if the episodes of all corridors have to begin again.
+            EpisodesLostError: if the episodes of all corridors have to begin again.
         """
 
     def reason(self, corridor: int) -> str | None:

@@ -11,7 +11,13 @@ import numpy as np
 from merge_sumo.controllers.kinds import load
 from merge_sumo.controllers.spec import ControllerKind, ControllerOptions
 from merge_sumo.controllers.sumo_model import SumoDriver
-from merge_sumo.drivers.base import ControllerDiedError, Driver, DriverWrapper, PovDiedError, Scene
+from merge_sumo.drivers.base import (
+    Driver,
+    DriverWrapper,
+    EpisodesLostError,
+    PovEpisodesLostError,
+    Scene,
+)
 from merge_sumo.drivers.level0 import Level0Pov
 from merge_sumo.drivers.policies import (
     how_to_train,
@@ -237,12 +243,12 @@ class PovAdapter(DriverWrapper):
         self._driver.begin(corridor, seen_from(case, car))
 
     def act(self, scene: Scene) -> FloatArray:
-        """Return the driver's answers; raises `PovDiedError`."""
+        """Return the driver's answers; raises `PovEpisodesLostError`."""
         other = scene._replace(x_m=scene.x_m[::-1], v_mps=scene.v_mps[::-1])
         try:
             return self._driver.act(other)
-        except ControllerDiedError as lost:
-            raise PovDiedError(str(lost)) from lost
+        except EpisodesLostError as lost:
+            raise PovEpisodesLostError(str(lost)) from lost
 
 
 def seen_from(case: Case, car: int) -> Case:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from merge_sumo.drivers.acceleration_lane import Merging
 from merge_sumo.drivers.actuation import ROUNDING_MPS2
-from merge_sumo.drivers.base import ControllerDiedError, Driver, PovDiedError, Scene
+from merge_sumo.drivers.base import Driver, EpisodesLostError, PovEpisodesLostError, Scene
 from merge_sumo.drivers.car_following import conflicting_car, keep_safe
 from merge_sumo.scenario.case import Case, FloatArray
 from merge_sumo.scenario.scenario import DT_S, MAX_EPISODE_S, OWN, VUT
@@ -29,9 +29,9 @@ ANY_FAULT = (Exception, SystemExit)
 OF_THE_POV = "the POV: "
 """Prefix of the reason of an error that a POV made."""
 
-MAX_DEATHS = 2
-"""Number of deaths of the process of a controller, with one case alone, after which the case is at
-fault: a single death may have come from outside."""
+MAX_LOSSES = 2
+"""Number of `EpisodesLostError`, with one case alone, after which the case is at fault: a single
+one may have come from outside."""
 
 END_OF_ROAD_M = 20.0
 """Distance from the end of the road at which a follow-up ends."""
@@ -66,20 +66,21 @@ class Rollout:
 
     A corridor is refilled when its episode ends, so episodes do not end in order. An episode
     depends neither on the number of corridors nor on its neighbours. An error of the VUT ends its
-    episode as VUT_ERROR, an error of the POV as SIM_ERROR. When the process of a controller dies,
-    the running episodes begin again, one at a time; an episode is at fault if the process dies
-    `MAX_DEATHS` times while only that episode runs. When SUMO fails, the running episodes end as
-    SIM_ERROR, and SUMO is started again for the others.
+    episode as VUT_ERROR, an error of the POV as SIM_ERROR. After an `EpisodesLostError` the running
+    episodes begin again, one at a time; an episode is at fault if it is lost `MAX_LOSSES` times
+    while only that episode runs. When SUMO fails, the running episodes end as SIM_ERROR, and SUMO
+    is started again for the others.
 
-    A fault of a controller arrives as NaN, and `Driver.reason` says why. An exception comes only
-    from a driver in this process, and `ControllerDiedError` from a process that has ended.
+    A fault of a controller arrives as NaN, and `Driver.reason` says why, except where the
+    controller itself answers NaN or infinity. Other exceptions than `EpisodesLostError` and
+    `SimulationError` come only from a driver in this process.
 
     Example:
         trajectories = Rollout(simulation, pov, vut, cases).run()
 
     Attributes:
-        unexplained: indices of the cases that ran again although none was at fault: something from
-            outside ended the process.
+        ran_again: indices of the cases that ran again after a loss that no case explains, such as
+            the death of a process from outside.
     """
 
     def __init__(
@@ -104,12 +105,12 @@ class Rollout:
         self.has_traffic = len(self.mainline) > 1
         self.queue = enumerate(cases)
         self.suspects: deque[tuple[int, Case]] = deque()
-        """Cases that ran when a process of controllers died: each runs again alone."""
+        """Cases whose episodes were lost: each runs again alone."""
         self.alone = False
         """Whether a suspect runs alone."""
-        self.deaths = Counter[int]()
-        """How often a process died with one case alone, by the index of the case."""
-        self.unexplained = set[int]()
+        self.losses = Counter[int]()
+        """How often an episode was lost while it ran alone, by the index of its case."""
+        self.ran_again = set[int]()
         self.episodes: list[_Running | None] = [None] * corridors
         self.active = np.zeros(corridors, dtype=bool)
         self.step = np.zeros(corridors, dtype=np.int64)
@@ -122,11 +123,11 @@ class Rollout:
         """Rows of the record at which episodes, and after M their follow-ups, end."""
         self.follows_up = np.zeros(corridors, dtype=bool)
         """Whether an episode continues after M."""
-        # One row per step of the simulation: x, v, a of every vehicle.
         self.follow_steps = round(simulation.scenario.follow_up_s / DT_S)
         has_lane = simulation.scenario.lane_m is not None
         self.merging = Merging(corridors, simulation.scenario) if has_lane else None
         self.ring = RING_ROWS + self.follow_steps
+        # One row per step of the simulation: x, v, a of every vehicle.
         self.record = np.zeros((corridors, self.ring, vehicles, 3))
         self.ended: dict[int, Trajectory] = {}
         self.row = 0
@@ -148,7 +149,7 @@ class Rollout:
                 if self.merging is not None:
                     merged = self.merging.step(simulation.x_m, simulation.v_mps)
                 simulation.command(acceleration, merged)
-            except ControllerDiedError as lost:
+            except EpisodesLostError as lost:
                 self.begin_again(lost)
                 continue
             except SimulationError as error:
@@ -201,28 +202,29 @@ class Rollout:
         self.timeout_at[corridor] = self.row + self.follow_steps
         self.follows_up[corridor] = True
 
-    def begin_again(self, lost: ControllerDiedError) -> None:
+    def begin_again(self, lost: EpisodesLostError) -> None:
         """Let the running episodes begin again, one at a time; end the one at fault, if any.
 
         Until the last of these suspects has ended, `alone` is true, and `next_case` gives suspects
-        instead of new cases. An episode at fault explains every death before.
+        instead of new cases. Once an episode is at fault, the earlier losses count as its doing:
+        no case before it counts as one that ran again.
 
         Args:
-            lost: the death of the process of a controller.
+            lost: why the episodes are lost.
         """
         is_alone = np.count_nonzero(self.active) == 1
         for corridor, episode in enumerate(self.episodes):
             if episode is None:
                 continue
-            self.deaths[episode.index] += is_alone
-            if self.deaths[episode.index] == MAX_DEATHS:
-                self.unexplained.clear()
-                if isinstance(lost, PovDiedError):
+            self.losses[episode.index] += is_alone
+            if self.losses[episode.index] == MAX_LOSSES:
+                self.ran_again.clear()
+                if isinstance(lost, PovEpisodesLostError):
                     self.finish(corridor, End.SIM_ERROR, OF_THE_POV + str(lost))
                 else:
                     self.finish(corridor, End.VUT_ERROR, str(lost))
             else:
-                self.unexplained.add(episode.index)
+                self.ran_again.add(episode.index)
                 self.suspects.append((episode.index, episode.case))
         self.errors.clear()
         self.active[:] = False
@@ -279,7 +281,7 @@ class Rollout:
     def ask_drivers(self) -> FloatArray:
         """Return the answers of the drivers of all vehicles, (A, K), finite, in m/s2.
 
-        Faults of drivers are noted in `errors`, and answered with 0.
+        Faults of drivers are noted in `errors`, where `end_episodes` finds them; their answer is 0.
         """
         simulation = self.simulation
         x_m, v_mps = simulation.x_m, simulation.v_mps
@@ -294,7 +296,7 @@ class Rollout:
         try:
             of_vut = np.asarray(self.vut.act(scene), dtype=np.float64)
             self.take_signals(of_vut)
-        except (SimulationError, ControllerDiedError):
+        except (SimulationError, EpisodesLostError):
             raise
         except ANY_FAULT as error:
             self.raised = f"{type(error).__name__}: {error}"

@@ -98,7 +98,7 @@ class Simulator:
         self.in_sumo = range(len(cases)) if isinstance(self.simulation, SumoSimulation) else ()
         rollout = Rollout(self.simulation, self.pov, self.vut, cases)
         trajectories = rollout.run()
-        self.ran_again = rollout.unexplained
+        self.ran_again = rollout.ran_again
         return trajectories
 
     def close(self) -> None:

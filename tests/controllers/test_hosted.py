@@ -21,7 +21,7 @@ from support.scenes import scene_of
 from merge_sumo.controllers.kinds import load
 from merge_sumo.controllers.process import append
 from merge_sumo.controllers.spec import ControllerOptions
-from merge_sumo.drivers.base import ControllerDiedError, Scene
+from merge_sumo.drivers.base import EpisodesLostError, Scene
 from merge_sumo.errors import UserError
 
 OPTIONS = ControllerOptions(deadline_s=0.3)
@@ -75,7 +75,7 @@ def test_after_a_death_it_starts_again_and_knows_which_files_there_were(write_vu
     vut = load(write_vut("import os\ndef Vut(seen):\n    os._exit(3)\n"), OPTIONS).open(2)
     try:
         for _ in range(2):
-            with pytest.raises(ControllerDiedError, match="exit code 3"):
+            with pytest.raises(EpisodesLostError, match="exit code 3"):
                 vut.act(scene(2))
             assert {file.name for file in vut.files()} == {"my_vut.py"}
     finally:
@@ -100,7 +100,7 @@ def Vut(seen):
 """
     vut = load(write_vut(source), OPTIONS).open(2)
     try:
-        with pytest.raises(ControllerDiedError, match=r"the deadline of 0\.3 s"):
+        with pytest.raises(EpisodesLostError, match=r"the deadline of 0\.3 s"):
             vut.act(scene(2))
     finally:
         vut.close()

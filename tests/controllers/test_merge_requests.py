@@ -11,7 +11,7 @@ import pytest
 from support.vut_contract import begin, factory, on_lane
 
 from merge_sumo.controllers.controller import seen_in
-from merge_sumo.drivers.base import MERGE, NO_REQUEST, STAY, ControllerDiedError
+from merge_sumo.drivers.base import MERGE, NO_REQUEST, STAY, EpisodesLostError
 
 
 def begun(vut, corridors, **options):
@@ -135,7 +135,7 @@ def test_another_answer_is_an_error_of_its_own_corridor(write_vut, answer):
 def test_a_batch_of_another_shape_is_an_error_of_all(write_vut, answer, said):
     source = OF_ALL.replace("np.where(seen.merged, 0.5, 1.0), seen.may_merge", answer)
     driver = begun(write_vut(source), 2, in_process=True)
-    with pytest.raises(ControllerDiedError, match=re.escape(said)):
+    with pytest.raises(EpisodesLostError, match=re.escape(said)):
         driver.act(on_lane([-71.0, -90.0], [False, False]))
 
 
@@ -158,7 +158,7 @@ def Vut(seen):
 """
     driver = begun(write_vut(source), 2, deadline_s=1.0)
     try:
-        with pytest.raises(ControllerDiedError, match="broke the channel to its process"):
+        with pytest.raises(EpisodesLostError, match="broke the channel to its process"):
             driver.act(on_lane([-71.0, -71.0], [False, False]))
     finally:
         driver.close()

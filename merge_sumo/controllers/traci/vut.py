@@ -28,7 +28,7 @@ from merge_sumo.controllers.process import (
 from merge_sumo.controllers.spec import ControllerKind
 from merge_sumo.controllers.traci.server import FaultError, Reply, ServerProcess
 from merge_sumo.drivers.acceleration_lane import speed_to_stop_mps
-from merge_sumo.drivers.base import MERGE, STAY, ControllerDiedError, Driver, Scene
+from merge_sumo.drivers.base import MERGE, STAY, Driver, EpisodesLostError, Scene
 from merge_sumo.errors import UserError
 from merge_sumo.files import check_code
 from merge_sumo.road.road import Road
@@ -155,7 +155,7 @@ class TraciDriver(ControllerDriver):
             self._connect()
         except BaseException as error:
             self.close()
-            if isinstance(error, FaultError | ControllerDiedError):
+            if isinstance(error, FaultError | EpisodesLostError):
                 raise UserError(str(error)) from error
             raise
 
@@ -178,7 +178,7 @@ class TraciDriver(ControllerDriver):
             scene: the state of the corridor.
 
         Raises:
-            ControllerDiedError: if the serving process has ended.
+            EpisodesLostError: if the serving process has ended.
         """
         if not self._reasons:
             try:
@@ -200,7 +200,7 @@ class TraciDriver(ControllerDriver):
         """Let the client see the last arrival and end; then end it."""
         ends = True
         if self._client is not None:
-            with suppress(FaultError, ControllerDiedError):
+            with suppress(FaultError, EpisodesLostError):
                 ends = self._ask("farewell").closed
         self._disconnect(grace=ends)
         self._server.kill()
@@ -247,7 +247,7 @@ class TraciDriver(ControllerDriver):
 
         Raises:
             FaultError: the client made a mistake.
-            ControllerDiedError: the process has ended.
+            EpisodesLostError: the process has ended.
         """
         patience_s += self._options.deadline_s + WORK_S
         try:
@@ -258,7 +258,7 @@ class TraciDriver(ControllerDriver):
                 raise FaultError(reason) from died
             # Killed from outside, or by a question of the client: the case runs again, which shows.
             self._disconnect()
-            raise ControllerDiedError(reason) from died
+            raise EpisodesLostError(reason) from died
         self._in_vain.update(reply.in_vain)
         if not reply.fault or reply.closed:
             return reply
