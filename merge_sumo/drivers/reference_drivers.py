@@ -47,8 +47,8 @@ from merge_sumo.drivers.reference_models import (
     ReferenceModel,
     Reg157Model,
     RssModel,
+    bumper_ttc_s,
     rss_distance_m,
-    ttc_s,
 )
 from merge_sumo.scenario.case import Case, FloatArray
 from merge_sumo.scenario.scenario import DT_S
@@ -223,7 +223,7 @@ class CarefulVut(ReferenceVut):
             scene: the present state.
             nominal: the nominal prediction.
         """
-        return nominal.t_s + ttc_s(*nominal.pair[:3]) < self.model.critical_ttc_s
+        return nominal.t_s + bumper_ttc_s(*nominal.pair[:3]) < self.model.critical_ttc_s
 
 
 class FsmVut(ReferenceVut):
@@ -323,7 +323,7 @@ class CarefulPov(Driver):
         limit_mps2 = min(-self.scenario.a_min_mps2, CarefulModel.hardest_mps2)
         t_s = scene.distance_m / np.maximum(v_vut, SLOWEST_MPS)
         dx_m = scene.dx_at_m(t_s)
-        collides_s = t_s + ttc_s(-dx_m - crash_m, v_pov, v_vut)
+        collides_s = t_s + bumper_ttc_s(-dx_m - crash_m, v_pov, v_vut)
         ahead = (scene.x_vut_m > scene.x_pov_m) & (dx_m < crash_m)
         unsafe: Flags = ahead & (collides_s < CarefulModel.critical_ttc_s)
         return self._reaction.acceleration_mps2(unsafe, limit_mps2)

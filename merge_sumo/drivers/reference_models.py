@@ -107,7 +107,7 @@ class CarefulModel(ReferenceModel):
         Args:
             pair: the vehicles.
         """
-        return ttc_s(*pair[:3]) <= self.critical_ttc_s
+        return bumper_ttc_s(*pair[:3]) <= self.critical_ttc_s
 
 
 class Reg157Model(ReferenceModel):
@@ -135,7 +135,7 @@ class Reg157Model(ReferenceModel):
         """
         closing_mps = pair.v_rear_mps - pair.v_front_mps
         bound_s = closing_mps / (2.0 * self.hardest_mps2) + self.bound_s
-        return ttc_s(*pair[:3]) <= bound_s
+        return bumper_ttc_s(*pair[:3]) <= bound_s
 
 
 class RssModel(ReferenceModel):
@@ -242,7 +242,7 @@ class FsmModel(ReferenceModel):
         return np.where(closing > 0.0, np.where(after < 0.0, slower, found), 0.0)
 
 
-def ttc_s(gap_m: FloatArray, v_rear_mps: FloatArray, v_front_mps: FloatArray) -> FloatArray:
+def bumper_ttc_s(gap_m: FloatArray, v_rear_mps: FloatArray, v_front_mps: FloatArray) -> FloatArray:
     """Compute the time to collision.
 
     Args:
