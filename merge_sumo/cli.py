@@ -104,7 +104,8 @@ class Commands(App):
         index = 0
         for argument in arguments:
             name = argument.field_info.name
-            # A dataclass lists inherited keywords before its own arguments, which hides these.
+            # Inherited keywords come first in a dataclass; cyclopts would not see the positional
+            # arguments after them.
             if argument.keys and argument.field_info.is_positional:
                 argument.index = index
                 index += 1

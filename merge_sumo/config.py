@@ -1,7 +1,11 @@
 """Settings of the verbs: one dataclass each, whose fields are keywords in Python and options.
 
-Shared fields stand in base classes. `None` stands for the default of the scenario, or, for a
-recorded campaign, for the value of the campaign.
+Shared fields stand in base classes. `None` means: as in the scenario; for a recorded campaign: as
+it was recorded. An option has the name of its field, unless `console.FLAGS` gives another.
+
+A field of `ScenarioChanges` has the name of a field of `Scenario`, which it replaces
+(`from_config.scenario_from`). One of `Search`, `FailureRule` or `Limits` is a field of
+`CampaignSettings`, and reaches the simulation only where `load_plan` gives it to `SimulationPlan`.
 """
 
 from __future__ import annotations
@@ -119,8 +123,8 @@ class Search:
     instead of batches: for controllers that take seconds for a case. About three times the
     workers."""
     repeat: int = 1
-    """Number of runs of each case, each with other random numbers. Each run is one of the
-    --cases."""
+    """Number of runs of each case. They differ by the seed that `reset` of a controller gets, and
+    by the noise and dropouts of --sense; else all are alike. Each run is one of the --cases."""
     tolerated: float = 0.0
     """A case fails where more than this share of its runs do."""
     seed: int = 0
@@ -656,7 +660,7 @@ class Reproduce(Execution, Policies):
 
 
 def values_of(config: object, kind: type[Any]) -> dict[str, Any]:
-    """Return fields of a config by name.
+    """Return the values in a config of the fields of one of its base classes, by name.
 
     Args:
         config: the config.
@@ -666,7 +670,9 @@ def values_of(config: object, kind: type[Any]) -> dict[str, Any]:
 
 
 def non_defaults(config: object, kind: type[Any]) -> dict[str, Any]:
-    """Return fields of a config that differ from their defaults, by name.
+    """Return the same, without the fields whose values are the defaults.
+
+    A default that the user wrote counts as not given.
 
     Args:
         config: the config.

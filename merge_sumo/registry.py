@@ -1,5 +1,6 @@
 """Registries of samplers, controllers and measures, of this package and by entry points.
 
+They are `samplers.registry.SAMPLERS`, `controllers.kinds.KINDS` and `metrics.measures.MEASURES`.
 A registry names its objects without importing them: names of this package stand in the registry,
 names of others in the metadata of installed packages. An object is imported when it is asked for.
 Only installed packages, which the user chose, are searched; the working folder is data.

@@ -1,7 +1,7 @@
 """Workers: this process, worker processes, or a Dask cluster.
 
 A chunk of items is submitted to a `concurrent.futures.Executor`, and its results are collected.
-Where a worker dies, its items run again with nothing else in their worker.
+Where a worker dies, its items run again one by one, with nothing else in their worker.
 """
 
 from __future__ import annotations
@@ -78,14 +78,14 @@ class Job(Generic[T, R]):
         chunks: the chunks.
         lost: gives the result of an item that ended its worker twice.
         futures: of the chunks, in their order.
-        retried: places of items that ran again, because a worker had died.
+        ran_again: places of items that ran again, because a worker had died.
     """
 
     function: Callable[[Sequence[T]], Sequence[R]]
     chunks: Sequence[Sequence[T]]
     lost: Callable[[T], R]
     futures: list[Future[Sequence[R]]] = field(default_factory=list)
-    retried: set[int] = field(default_factory=set)
+    ran_again: set[int] = field(default_factory=set)
 
 
 class Workers(AbstractContextManager["Workers"]):
@@ -187,7 +187,7 @@ class Workers(AbstractContextManager["Workers"]):
                         raise WorkersLostError(LOST)
                 results += future.result()
             except self._died:
-                job.retried.update(range(len(results), len(results) + len(chunk)))
+                job.ran_again.update(range(len(results), len(results) + len(chunk)))
                 results += self._retry(job, chunk)
             except self._gone as error:  # nothing is cancelled whose result is collected
                 raise WorkersLostError(LOST) from error

@@ -14,7 +14,7 @@ from merge_sumo.analysis.comparison import Change, ComparedCase
 from merge_sumo.campaigns.recorded import RecordedCampaign
 from merge_sumo.errors import UserError, explained
 from merge_sumo.metrics.criterion import PAPER_CRITERION, Criterion
-from merge_sumo.metrics.measures import Measures, measures_in
+from merge_sumo.metrics.measures import Measures, recorded_measures
 from merge_sumo.metrics.merge import Severity
 from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.records import Record, convert, read_toml, to_json
@@ -95,7 +95,7 @@ class CasesFile(RecordedCampaign):
         merged = Measures(end=End.MERGED, t_end_s=0.0)
         whole: dict[str, Any] = {"level": None, "batch": 0}
         whole |= dict.fromkeys(self.scenario.case_fields)
-        for name in measures_in(self.scenario):
+        for name in recorded_measures(self.scenario):
             whole[name] = merged.value(name)
         whole["v_vut0_mps"] = self.scenario.bounds("v_vut0_mps")[0]
         outcome = Outcome.from_json(to_json(whole | line), self.scenario)

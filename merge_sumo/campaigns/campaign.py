@@ -58,8 +58,9 @@ def run_campaign(
     """Run a campaign into a new folder, or one that was stopped to its end; return it.
 
     Same settings, same versions: same `outcomes.jsonl`, whatever the workers, and as if the
-    campaign had never been stopped; also where the settings have more cases than it had, if those
-    ended with a whole batch. The worst failures are exported as folders that sumo-gui opens.
+    campaign had never been stopped. A campaign that is resumed with more cases also gives these
+    outcomes, if its earlier number of cases ended with a whole batch. The worst failures are
+    exported as folders that sumo-gui opens.
 
     Args:
         settings: what to run; to resume, the settings of the folder with the controllers that were
@@ -82,7 +83,7 @@ def run_campaign(
     else:
         check_new(folder)
         check_new(folder / SCENARIOS / case_name(settings.cases))
-    # No more corridors than cases run at a time.
+    # More corridors than cases that run at a time would stay empty.
     batch = settings.batch if SAMPLERS[settings.sampler].learns else None
     plan = plan.for_cases(settings.in_flight or batch or settings.cases)
     plan = plan.with_log(folder.resolve() / LOG)
@@ -109,7 +110,7 @@ def run_campaign(
             settings.cases,
             workers=workers,
             batch=settings.batch,
-            draws=settings.repeat,
+            repeat=settings.repeat,
             in_flight=settings.in_flight or 0,
             stop=settings.stopping_rule(),
             history=history,

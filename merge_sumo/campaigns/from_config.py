@@ -45,7 +45,9 @@ def scenario_from(
 def named_settings(
     config: c.Drivers | c.CheckVut, scenario: Scenario | None = None
 ) -> dict[str, Any]:
-    """Return the settings that a config names, by the fields of `CampaignSettings`.
+    """Return the settings whose values differ from the defaults, by fields of `CampaignSettings`.
+
+    A default that the user wrote counts as not given: the value of a recorded campaign stays.
 
     Args:
         config: the config.

@@ -137,7 +137,7 @@ class Journal:
     def append(self, *batches: Sequence[Episode]) -> None:
         """Write batches and sync them to the disk.
 
-        Loaded files, commands without effect and retried cases are noted in the settings.
+        Loaded files, commands without effect and cases that ran again are noted in the settings.
 
         Args:
             batches: the episodes of each batch.

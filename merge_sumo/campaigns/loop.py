@@ -1,8 +1,8 @@
 """The loop of a campaign: it asks, submits, collects, stores, tells.
 
 Cases are proposed in batches. Those whose outcomes the sampler was not told yet are pending. Before
-the loop asks the sampler again, it tells it the oldest batches, only those that make room for the
-next one:
+each ask, the loop tells the sampler the outcomes of the oldest batches: as many as it must to make
+room for one more. How many cases may be pending depends on settings and sampler:
 
     a batch       waits for the one before
     in flight     N cases may be pending, in batches of a third, of a sampler that `overlaps`
@@ -68,7 +68,7 @@ class SearchLoop:
         *,
         workers: Workers | None = None,
         batch: int | None = None,
-        draws: int = 1,
+        repeat: int = 1,
         in_flight: int = 0,
         stop: Callable[[Sequence[Outcome]], bool] | None = None,
         history: Iterable[Episode] = (),
@@ -81,7 +81,7 @@ class SearchLoop:
             cases: number of cases after which the search ends.
             workers: where they run; by default in this process, whose simulator stays open.
             batch: cases of a batch; by default the number that the sampler wants.
-            draws: runs of each case that the sampler proposes. All are in one batch.
+            repeat: how often each proposed case runs; all its runs are in one batch.
             in_flight: most cases in flight; 0 for one batch.
             stop: whether the outcomes with a verdict end the search.
             history: whole batches that ran before, in order.
@@ -90,7 +90,7 @@ class SearchLoop:
         self._simulate = partial(simulate_part, plan, keep=with_measures)
         self._lost = partial(lost_episode, plan)
         self._workers = Workers() if workers is None else workers
-        self._batch_size, self._draws, self._in_flight = batch, draws, in_flight
+        self._batch_size, self._repeat, self._in_flight = batch, repeat, in_flight
         self._ahead = not sampler.learns and stop is None
         self._overlaps = in_flight > 0 and sampler.overlaps
         batches = groupby(history, key=lambda episode: episode.outcome.batch)
@@ -109,7 +109,7 @@ class SearchLoop:
         """
         running: deque[tuple[list[_Batch], Job[Case, Episode] | None]] = deque()
         while True:
-            while self._has_room(len(running)) and (batches := self._ask()):
+            while self._may_ask(len(running)) and (batches := self._ask()):
                 job = None
                 if not batches[0].episodes:
                     cases = [case for batch in batches for case in batch.cases]
@@ -126,8 +126,8 @@ class SearchLoop:
             del self._pending[: len(batches)]
             self._set_pending()
 
-    def _has_room(self, running: int) -> bool:
-        """Return whether the sampler is asked before it is told the oldest batch."""
+    def _may_ask(self, running: int) -> bool:
+        """Return whether the sampler may be asked for more now, besides the batches that run."""
         if self._ahead:
             return running < BATCHES_IN_FLIGHT
         if self._overlaps and running:
@@ -146,9 +146,9 @@ class SearchLoop:
         batches = []
         while self._cases_proposed < end:
             cases, predictions = [], []
-            size = max(1, self._next_size() // self._draws)
+            size = max(1, self._next_size() // self._repeat)
             for place, case in enumerate(self._sampler.ask(size)):
-                for draw in range(self._draws):
+                for draw in range(self._repeat):
                     cases.append(replace(case, draw=draw))
                     predictions.append(None if draw else self._sampler.prediction(place))
             left = self._until - self._cases_proposed
@@ -202,7 +202,7 @@ class SearchLoop:
         """Collect the episodes of batches; note which ran again because a worker had died."""
         episodes = self._workers.collect(job)
         self._cases_ran += len(episodes)
-        for place in job.retried:
+        for place in job.ran_again:
             episodes[place] = replace(episodes[place], ran_again=True)
         rest = iter(episodes)
         for batch in batches:

@@ -5,9 +5,9 @@
 
 # An episode must depend on its case alone. A controller that draws random numbers without the seed
 # of its case, reads a clock, or keeps a state from one episode to the next violates this: its
-# results depend on the number of workers, on the sampler, and on chance. The first cases run again,
-# which a new controller ran, and others, in reverse order. The VUTs of this package need no such
-# check.
+# results depend on the number of workers, on the sampler, and on chance. `cases_to_repeat` chooses
+# the cases. The VUTs of this package need no such check. The option --repeat is another thing: it
+# runs each case several times with other random numbers.
 
 from __future__ import annotations
 
@@ -95,8 +95,9 @@ def check_repeatability(
 def cases_to_repeat(outcomes: Sequence[Outcome], settings: CampaignSettings) -> list[Outcome]:
     """Return the outcomes of the cases that are to run again, in that order.
 
-    Half are the first cases, which a new controller ran; the others are spread over the campaign,
-    and run before those. Errors are left out: a slow machine may have caused them.
+    Half are spread over the campaign, and run first. The other half are the first cases of the
+    campaign, which a new controller ran; they run last. Both are in reverse order. Errors are left
+    out: a slow machine may have caused them.
 
     Args:
         outcomes: all outcomes of the campaign.

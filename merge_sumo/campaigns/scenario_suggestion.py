@@ -53,12 +53,12 @@ def suggested(road: Road, name: str) -> Scenario:
         name: name of the scenario.
     """
     limit_mps = min(road.mainline.piece(-1.0).speed_limit_mps, US23.v_hw_max_mps)
-    gore_m = road.lane_m[0] if road.lane_m else 0.0
+    gore_m = road.used_lane_m[0] if road.used_lane_m else 0.0
     far_m = min(US23.x_vut0_m, gore_m - BEFORE_GORE_M)
     x_vut0_m = _down(max(far_m, gore_m - ROOM * (road.ramp.before_m + gore_m)))
     v_vut0_mps = round(min(V_VUT0_MPS, road.ramp.piece(x_vut0_m).speed_limit_mps), 1)
     level0_v_mps = round(min(US23.level0_v_mps, limit_mps), 1)
-    lane_m = road.lane_m and suggested_lane_m(road)
+    lane_m = road.used_lane_m and suggested_lane_m(road)
     way_m = np.array([0.0, lane_m[1] if lane_m else 0.0]) - x_vut0_m
     profile = replace(US23, level0_v_mps=level0_v_mps)
     due_s, end_s = level0_time_to(way_m, np.array(v_vut0_mps), profile).tolist()
@@ -82,7 +82,7 @@ def suggested(road: Road, name: str) -> Scenario:
         reach_m=max(US23.reach_m, float(math.ceil(-low)), float(math.ceil(-x_vut0_m))),
         lane_m=lane_m,
         timeout_s=min(max(US23.timeout_s, float(math.ceil(PATIENCE * end_s))), MAX_EPISODE_S),
-        follow_up_s=FOLLOW_UP_S if road.lane_m else US23.follow_up_s,
+        follow_up_s=FOLLOW_UP_S if road.used_lane_m else US23.follow_up_s,
     )
 
 
@@ -110,14 +110,14 @@ def about(road: Road) -> list[str]:
             f"{name}: {' '.join(edges)}, {path.before_m:.1f} m before M; speed limits from "
             f"{min(limits_mps):g} to {max(limits_mps):g} m/s"
         )
-    m = road.lane_point(0.0, on_ramp=road.lane_m is None)
+    m = road.lane_point(0.0, on_ramp=road.used_lane_m is None)
     merge = f"M: lane {m.lane} at ({m.x_m:.1f}, {m.y_m:.1f})"
     if road.is_one_path:
         return [*lines, merge]
     lane = road.acceleration_lane
     if lane is not None:
         ends = f"{' '.join(lane.lanes)}, from {lane.begin_m:.1f} m, the gore, to {lane.end_m:.1f} m"
-        if road.lane_m is not None:
+        if road.used_lane_m is not None:
             merge += ", where a merge is expected"
             return [*lines, f"acceleration lane: {ends}", merge]
         lines.append(f"lane next to the mainline, not used as an acceleration lane: {ends}")

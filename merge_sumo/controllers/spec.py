@@ -113,11 +113,12 @@ class ControllerSpec(msgspec.Struct, frozen=True):
 
 
 class ControllerKind:
-    """A controller that has been loaded; each kind of controller is a subclass.
+    """An instance is a loaded controller; a class is a kind of controller.
 
     The settings of a campaign hold the text of a controller, its plan holds an instance of this
     class, and each process that runs cases opens a `Driver` of it. A kind whose corridors have a
-    controller each implements `controller`; another kind implements `driver`.
+    controller each implements `controller`; another kind implements `driver`. A text named `kind`
+    is the name of a kind.
 
     Example:
         ```python
@@ -133,7 +134,10 @@ class ControllerKind:
         has_parameters: whether "?" ends the argument in a spec.
         no_parameters: why a spec cannot set parameters, in a clause; "" where it can.
         hosted: whether it runs a user's code, so that `kinds.load` gives it a process of its own.
-        own_code: whether a test runs code that is neither of this package nor of SUMO.
+            Such a kind implements `controller`, or a `driver` that is a `ControllerDriver`. It
+            cannot ask SUMO, and of its attributes only `no_parameters`, `max_workers`,
+            `max_corridors` and `code` reach the plan (`HostedKind`).
+        own_code: whether code of the user runs in a test.
         files_are_known: whether `code` names all files of the controller before it drives.
         asks_sumo: whether its drivers ask SUMO, or are SUMO's own; their cases take longer.
         spec: the controller.

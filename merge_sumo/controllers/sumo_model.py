@@ -120,7 +120,7 @@ class SumoDriver(Driver):
         """
         super().__init__(corridors)
         self.simulation, self._rows = simulation, list(rows)
-        self._chooses = simulation.road.lane_m is not None and self._rows == [VUT]
+        self._chooses = simulation.road.used_lane_m is not None and self._rows == [VUT]
         self._merges = np.zeros(simulation.corridors, dtype=np.bool_)
 
     def act(self, scene: Scene) -> FloatArray:

@@ -18,7 +18,7 @@ from merge_sumo.metrics.measures import (
     MEASURES,
     Measures,
     known_measures,
-    measures_in,
+    recorded_measures,
 )
 from merge_sumo.metrics.merge import Severity
 from merge_sumo.metrics.outcome import Outcome
@@ -35,7 +35,7 @@ class NamedCriterion:
     """A criterion with a name.
 
     Attributes:
-        condition: condition over measures under which a case fails.
+        condition: text of the condition over measures under which a case fails.
         about: meaning of the condition, in a phrase.
     """
 
@@ -115,7 +115,7 @@ class Criterion:
         if self.require is not None:
             try_formula(self.require)
             return
-        missing = condition_of(self.condition).names - measures_in(scenario).keys()
+        missing = condition_of(self.condition).names - recorded_measures(scenario).keys()
         if missing:
             name = min(missing)
             raise UserError(
@@ -151,7 +151,7 @@ class Criterion:
 
     @property
     def condition(self) -> str:
-        """The condition under which a case fails."""
+        """The text of the condition under which a case fails; `condition_of` parses it."""
         named = CRITERIA.get(self.as_written)
         return self.as_written if named is None else named.condition
 
@@ -243,8 +243,8 @@ def values_of(measures: Measures, names: Iterable[str] | None = None) -> dict[st
         names: names of the measures; None for the whole vocabulary.
 
     Returns:
-        By name; a measure without a value has `Measure.missing`, or "" if it is a text. Where a
-        conflict or contact leaves no braking and no way out that is enough, it has its worst value.
+        By name; a measure without a value has `Measure.missing`, or "" if it is a text. Where it is
+        too late to brake or to avoid, the value is the worst: infinity at the bad end.
     """
     after_gap_m = measures.after_gap_m
     is_too_late = {

@@ -3,8 +3,9 @@
 A condition has comparisons with `and`, `or`, `not` and brackets, as in Python:
 `ttc_s < 1.5 or drac_mps2 > 4 or end == "TIMEOUT"`. Its margin is the negative robustness of
 Fainekos and Pappas (2009): below 0 where the condition is met. That of a comparison is the distance
-to its threshold in units of the threshold (of 1 for a threshold of 0, and for two values), that of
-two texts 1; `and` is the largest of its parts, `or` the smallest, and `not` changes the sign.
+to its threshold in units of the threshold (a threshold of 0, and a comparison of two measures, have
+the unit 1), that of two texts 1; `and` is the largest of its parts, `or` the smallest, and `not`
+changes the sign.
 """
 
 from __future__ import annotations

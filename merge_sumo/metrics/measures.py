@@ -1,7 +1,12 @@
 """Measures of an episode: decorated functions of `Measures`, or of installed packages.
 
 The function has the name of the measure in records and conditions, with the unit at its end, and
-its docstring is the definition. Records, `--fail-when`, reports, exports and documentation follow.
+its docstring is the definition. `OURS` has the measures of this package, and `MEASURES` also those
+of others. Records (`Outcome.to_record`), `--fail-when` (`criterion.vocabulary`), the table of the
+report (`report_data.page_data`) and the listing of `run` (`text._measures`) loop over them.
+
+A new measure of this package, unless it is of the follow-up, is required in records
+(`outcome.record_of`): campaigns of earlier versions can then not be read any more.
 
     from merge_sumo.metrics.measures import Measures, measure
 
@@ -61,12 +66,14 @@ class Measure(Generic[T]):
         function: returns the value of an episode; None or infinite where it has none.
         unit: empty for a number without one, and for a text.
         label: name in the listing of an episode; empty where that leaves it out.
-        column: name in the table of the report; empty where that leaves it out.
+        column: heading in the table All cases of the report (`allCases` in report.js); empty where
+            that leaves it out.
         digits: decimals in tables.
-        missing: value in conditions where an episode has none; None for a text.
+        missing: value in conditions where an episode has none. A measure without it is no number:
+            a condition may name it only if it is one of `criterion.TEXTS`.
         worse: end of the values at which an episode is worse; None where neither end is.
         only_with: part of a scenario that the measure needs; empty for every scenario.
-        default: value where nothing is recorded.
+        default: value where none is recorded, as in a scenario without the part `only_with`.
     """
 
     function: Callable[[Any], T]
@@ -128,8 +135,9 @@ def measure(
     """Declare a measure by its function, whose name ends with the unit.
 
     Args:
-        worse: end of the values at which an episode is worse. An episode without a value counts as
-            one at the other end, such as cars that never meet.
+        worse: end of the values at which an episode is worse. In conditions an episode without a
+            value counts as harmless, such as cars that never meet: as infinity if low is worse, and
+            as 0 if high is worse.
         shown: other attributes of `Measure`.
     """
     missing = {"low": math.inf, "high": 0.0, None: None}[worse]
@@ -249,14 +257,14 @@ class Measures:
     @measure(label="front bumpers, x_POV - x_VUT", column="Δx at M", missing=math.inf)
     def dx_m(self) -> float | None:
         """x_POV - x_VUT, of the front bumpers."""
-        return self._at_end(0)
+        return self._at_m(0)
 
     @measure(label="v_POV - v_VUT", column="dv", missing=0.0)
     def dv_mps(self) -> float | None:
         """v_POV - v_VUT."""
-        return self._at_end(1)
+        return self._at_m(1)
 
-    def _at_end(self, column: int) -> float | None:
+    def _at_m(self, column: int) -> float | None:
         """Return the difference of the car at M and the VUT."""
         if self.end is not End.MERGED:
             return None
@@ -377,18 +385,12 @@ class Measures:
         column="POV brakes over 1.6 s",
     )
     def pov_sustained_brake_mps2(self) -> float | None:
-        """Largest mean deceleration of the POV over 1.6 s, or over a shorter episode.
-
-        None in records of versions without it.
-        """
+        """Largest mean deceleration of the POV over 1.6 s, or over a shorter episode."""
         return sustained_brake_mps2(self.trajectory.motion[:, self.trajectory.nearest, 1])
 
     @measure(worse="high", label="slow-down of the POV", column="POV slows by")
     def pov_slowdown_mps(self) -> float | None:
-        """Largest loss of speed of the POV up to t1, from the highest speed before.
-
-        None in records of versions without it.
-        """
+        """Largest loss of speed of the POV up to t1, from the highest speed before."""
         v_mps = self.trajectory.motion[:, self.trajectory.nearest, 1]
         return float((np.maximum.accumulate(v_mps) - v_mps).max())
 
@@ -597,7 +599,7 @@ def known_measures() -> dict[str, Measure[Any]]:
     return dict(MEASURES)
 
 
-def measures_in(scenario: Scenario) -> dict[str, Measure[Any]]:
+def recorded_measures(scenario: Scenario) -> dict[str, Measure[Any]]:
     """Return the measures that are recorded in a scenario, by name.
 
     Args:

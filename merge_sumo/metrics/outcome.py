@@ -11,7 +11,7 @@ import numpy as np
 from msgspec import Meta
 
 from merge_sumo.files import Files
-from merge_sumo.metrics.measures import FOLLOW_UP, OURS, Measures, measures_in
+from merge_sumo.metrics.measures import FOLLOW_UP, OURS, Measures, recorded_measures
 from merge_sumo.metrics.paper import margin_of
 from merge_sumo.records import Record, convert, decode, record_type, to_plain
 from merge_sumo.scenario.case import Case, FloatArray
@@ -64,7 +64,7 @@ class Outcome:
     """The result of a case: its measures and its margin.
 
     Attributes:
-        index: place of the case in its campaign.
+        index: place of the case in its campaign; in its chunk until `Episode.at` sets it.
         batch: batch in which the case ran.
         case: the case.
         measures: the measures of its episode.
@@ -131,7 +131,7 @@ class Outcome:
             record[name] = getattr(self.case, name)
         if self.case.draw:
             record["draw"] = self.case.draw
-        for name in measures_in(scenario):
+        for name in recorded_measures(scenario):
             record[name] = self.measures.value(name)
         if not self.is_by_score:
             record["margin"] = self.margin
@@ -153,7 +153,7 @@ class Outcome:
         known = convert(decode(line), record_of(scenario))
         coordinates = {name: getattr(known, name) for name in ("level", *scenario.case_fields)}
         case = Case(**coordinates, draw=known.draw, scenario=scenario)
-        measures = Measures(**{name: getattr(known, name) for name in measures_in(scenario)})
+        measures = Measures(**{name: getattr(known, name) for name in recorded_measures(scenario)})
         return cls(known.index, known.batch, case, measures, known.foretold, known.margin)
 
 
@@ -167,7 +167,7 @@ def record_of(scenario: Scenario) -> Any:
     types = {"index": int, "batch": int, **get_type_hints(Case)}
     required = [(name, types[name]) for name in ("index", "batch", "level", *scenario.case_fields)]
     optional: list[tuple[str, Any, Any]] = []
-    for name, one in measures_in(scenario).items():
+    for name, one in recorded_measures(scenario).items():
         if name in OURS and one.only_with != FOLLOW_UP:
             required.append((name, get_type_hints(one.function)["return"]))
         else:
@@ -189,7 +189,8 @@ class Episode:
         trajectory: the motion of all vehicles.
         files: hashes of the user's files that the VUT has loaded, by path.
         pov_files: hashes of those that the user's POV has loaded.
-        ran_again: whether the case was retried after the death of a process.
+        ran_again: whether the case ran again after a worker had died, or after the loss of episodes
+            that no case explains (`Rollout.ran_again`).
         in_sumo: whether SUMO ran the case, whichever engine the plan has.
         earlier: the same case with the earlier version, in a campaign against one.
     """
@@ -208,7 +209,8 @@ class Episode:
         Args:
             index: place of the case.
             batch: its batch.
-            prediction: its prediction; with two versions it is recorded with the earlier one.
+            prediction: its prediction. In a campaign against an earlier version it is that of the
+                regression, and goes into the record of the earlier version.
         """
         earlier = self.earlier
         if earlier is not None:

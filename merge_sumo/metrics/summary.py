@@ -73,7 +73,7 @@ class RunsOfCase:
     def deciding(self, tolerated: float = 0.0) -> Outcome:
         """Return the run that decides the case: it fails exactly where the case does.
 
-        Of the runs from the worst to the best it is the first one after the tolerated ones.
+        Sort the runs, the worst first; skip as many as may fail; it is the next.
 
         Args:
             tolerated: share of its runs in which a case may fail.

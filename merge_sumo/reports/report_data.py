@@ -10,7 +10,7 @@ import numpy as np
 
 from merge_sumo.analysis.surface import Grid, Surface, nodes
 from merge_sumo.metrics.fmc import fmc_growth, radius_for
-from merge_sumo.metrics.measures import measures_in
+from merge_sumo.metrics.measures import recorded_measures
 from merge_sumo.metrics.merge import Conflict, Severity
 from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.metrics.summary import CONFIDENCE, clopper_pearson, shortened
@@ -43,7 +43,9 @@ def page_data(model: ReportModel) -> dict[str, Any]:
         model: the content of the report.
 
     Returns:
-        `cases` has the shown cases as columns; `speeds` is as `packed` returns it.
+        `cases` has a list for each name of `_row`, with an item a shown case. `allCases` in
+        report.js makes the table All cases of it, with a column for each entry of `measures`.
+        `speeds` is as `packed` returns it.
     """
     scenario, lane_m = model.run.scenario, model.run.scenario.lane_m
     speeds, offsets = packed(model.motion)
@@ -57,7 +59,7 @@ def page_data(model: ReportModel) -> dict[str, Any]:
         for name, value in row.items():
             cases.setdefault(name, []).append(value)
     measures = []
-    for name, measure in measures_in(scenario).items():
+    for name, measure in recorded_measures(scenario).items():
         if measure.column and any(value is not None for value in cases.get(name, ())):
             unit = measure.unit.replace("s2", "s²")
             title = f"{scenario.wording(measure.column)} {unit}".rstrip()
@@ -92,7 +94,7 @@ def page_data(model: ReportModel) -> dict[str, Any]:
 
 
 def _row(model: ReportModel, outcome: Outcome) -> dict[str, Any]:
-    """Return a case by column; it has no rows where its motion is lost."""
+    """Return a case by the names of `cases`; `rows` is 0 where its motion is lost."""
     index, measures = outcome.index, outcome.measures
     motion, diagnosis = model.motion.get(index), model.diagnoses.get(index)
     row: dict[str, Any] = {
@@ -115,7 +117,7 @@ def _row(model: ReportModel, outcome: Outcome) -> dict[str, Any]:
     }
     for coordinate in model.coordinates:
         row[coordinate.field] = _rounded(coordinate.of(outcome.case), coordinate.digits + 2)
-    for name, measure in measures_in(outcome.case.scenario).items():
+    for name, measure in recorded_measures(outcome.case.scenario).items():
         if measure.column:
             row[name] = _rounded(measures.value(name), 4)
     if model.avoidance:

@@ -29,7 +29,7 @@ from merge_sumo.campaigns.recorded import RecordedCampaign
 from merge_sumo.drivers.reference_drivers import REFERENCE_DRIVERS
 from merge_sumo.metrics.cause import cause, conflicting_car
 from merge_sumo.metrics.fmc import fmc
-from merge_sumo.metrics.measures import measures_in
+from merge_sumo.metrics.measures import recorded_measures
 from merge_sumo.metrics.merge import Conflict
 from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.metrics.plausibility import late_errors
@@ -644,7 +644,7 @@ def _measures(outcome: Outcome) -> Iterator[str]:
     if car != "POV":
         yield f"  of the {car}, which is nearest to the VUT at the end:"
     rows = []
-    for name, measure in measures_in(scenario).items():
+    for name, measure in recorded_measures(scenario).items():
         value = found.value(name)
         if measure.label and value is not None:
             label = scenario.wording(measure.label).replace("POV", car)

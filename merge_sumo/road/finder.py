@@ -1,7 +1,7 @@
 """Find the merge in a net: the first lane that two sequences of edges have in common.
 
-A driver on a lane that ends changes to the lane next to it. The path crosses the junction next to
-the connection of that lane, and M is after the junction, as in a net with a connection of its own.
+A driver on a lane that ends changes to the lane next to it. Its path over the junction follows the
+connection of that lane. M is after the junction, as if the ending lane had a connection.
 
 An acceleration lane of a scenario ends at a coordinate above 0. There the paths become one; before,
 they are side by side, on lanes of the same edges.
@@ -250,7 +250,7 @@ def _road(
         ramp_approach=_approach(junction, meeting, RAMP),
         lane_drop=meeting.ending is not None,
         drawn_after_m=end_m + _length_m(onward),
-        lane_m=lane_m and (begin_m, end_m),
+        used_lane_m=lane_m and (begin_m, end_m),
         acceleration_lane=lane,
     )
 
@@ -374,7 +374,7 @@ def _acceleration_lane(
 
 
 def _window(lane: AccelerationLane | None, lane_m: Bounds) -> Bounds:
-    """Return begin and end of the lane of a road that has the lane of a scenario."""
+    """Return begin and end of the road's lane; refuse a lane of a scenario that is longer."""
     if lane is None:
         raise UserError(
             "ramp and mainline meet in one point, without a lane of the ramp side by side: leave "
@@ -426,8 +426,8 @@ def _layers(net: SumoNet, edges: _Edges, common: int) -> list[_Layer]:
     Args:
         net: the net.
         edges: ids of the edges of the path.
-        common: number of edges before the first that the paths share. A lane must lead to that one;
-            after it all lanes may end.
+        common: number of edges before the first that the paths share. Up to that edge some lane
+            must lead on; after it none has to.
     """
     layers: list[_Layer] = [dict.fromkeys(_lanes(net, edges[0]))]
     for number, (edge, following) in enumerate(pairwise(edges), start=1):

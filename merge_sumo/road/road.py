@@ -254,8 +254,8 @@ class Road:
         ramp_approach: right of way of the ramp at M.
         lane_drop: whether one path comes to M from a lane that ends.
         drawn_after_m: length after M in the file; from there the last lane continues straight on.
-        lane_m: begin and end of the acceleration lane of a scenario, as lane coordinates; None
-            where both paths meet in one point, M.
+        used_lane_m: begin and end of `acceleration_lane`, as lane coordinates, where a scenario
+            uses it; None where both paths meet in one point, M.
         acceleration_lane: that of the road, also where a scenario does not use it.
     """
 
@@ -270,7 +270,7 @@ class Road:
     ramp_approach: Approach
     lane_drop: bool
     drawn_after_m: float
-    lane_m: Bounds | None = None
+    used_lane_m: Bounds | None = None
     acceleration_lane: AccelerationLane | None = None
 
     @property

@@ -22,8 +22,8 @@ class Sampler(ABC):
     two calls return the same cases, and neither the order of outcomes nor a repeated `tell`
     matters. A campaign resumes by telling the outcomes of its journal to a new sampler.
 
-    A new sampler implements `ask`, or as a `LevelwiseSampler` only `propose`; `history`, `pending`,
-    `observed`, `proposed`, `shares` and `rng` are for it. For each batch a campaign calls
+    A new sampler implements `ask`, or as a `LevelwiseSampler` only `propose`. It may call
+    `history`, `pending`, `observed`, `proposed`, `shares` and `rng`. For each batch a campaign calls
     `batch_size`, `ask`, `prediction` of each case and `set_pending`; once the batch has run, `tell`
     and `set_pending`.
 

@@ -22,8 +22,7 @@ from merge_sumo.samplers.predictions import chance_by_gaps, disagreement
 from merge_sumo.samplers.surrogate import Surrogate, signed_gaps
 from merge_sumo.scenario.case import FloatArray
 
-# Fewest failures to aim at failures alone; otherwise the nearest cases stand in for them, after
-# PATIENCE cases.
+# With fewer failures than NEAREST after PATIENCE cases, the nearest misses count as failures, too.
 NEAREST = 3
 PATIENCE = 40
 # Covered share of the ball of a pending case, and least covered share of the ball of a pick.

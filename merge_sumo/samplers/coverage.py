@@ -89,7 +89,7 @@ class CoverageSampler(Sampler):
     def _proposals(
         self, searches: dict[int, LevelSearch], weight: float, n: int
     ) -> dict[int, Proposal]:
-        """Return a batch of `n` cases for each level."""
+        """Return `n` cases for each level; `_shares` decides how many of them run."""
         # A model whose predictions did not come true proposes no candidates, except where there is
         # no surrogate either.
         worthless = weight < 0.05 and len(self.observed()) >= 40
@@ -105,8 +105,8 @@ class CoverageSampler(Sampler):
             elif search.surrogate is not None:
                 proposal = search.surrogate_batch(n)
             else:
-                # The next points of the sequence that the pending ones began. Its seed does not
-                # count these, so that it stays the same.
+                # Continue the sequence of the pending cases: they are left out of its seed, so it
+                # is the same sequence.
                 begun, told = len(search.pending), self.proposed() - len(self._pending)
                 rng = np.random.default_rng([self.seed, told, level])
                 points = spread_out(begun + n, search.history.dims, rng)[begun:]

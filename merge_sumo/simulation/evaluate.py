@@ -51,12 +51,12 @@ def simulate(plan: SimulationPlan, cases: Sequence[Case]) -> list[Episode]:
 def simulate_part(
     plan: SimulationPlan, cases: Sequence[Case], keep: Callable[[Episode], R]
 ) -> list[R]:
-    """Run cases in this process; return a part of each episode, in order.
+    """Run cases in this process; return what `keep` makes of each episode, in order.
 
     Args:
         plan: how they run.
         cases: cases of the scenario of the plan.
-        keep: gives the part of an episode that is returned.
+        keep: gives what is returned of an episode.
 
     Raises:
         UserError: if the plan cannot be carried out.
@@ -84,8 +84,8 @@ def simulate_part(
 def with_measures(episode: Episode) -> Episode:
     """Compute all measures of an episode, and return it.
 
-    An episode that travels to another process leaves its trajectory behind, so that its measures
-    are computed before.
+    `Measures` are pickled without their trajectory: in another process nothing can be computed
+    any more.
 
     Args:
         episode: an episode with its trajectory.
@@ -115,7 +115,9 @@ def evaluate(
     workers: Workers | None,
     keep: Callable[[Episode], R],
 ) -> Iterator[R]:
-    """Simulate cases on workers; return their results in order, as they end.
+    """Simulate cases of a study on workers; return their results in order, as they end.
+
+    A campaign gives its cases to workers itself (`SearchLoop`).
 
     Args:
         plan: how they run.
@@ -223,5 +225,6 @@ def _simulate_both(
 
 
 def _open_simulators(plan: SimulationPlan, nothing: Sequence[None]) -> Sequence[None]:
+    """Open the simulator of a plan by running no cases; `_kept` holds it for the first chunk."""
     simulate(plan, [])
     return nothing

@@ -56,7 +56,7 @@ class SimulationPlan:
     """Everything that a process needs to run cases; it travels to workers with every chunk.
 
     Example:
-        plan = CampaignSettings(vut="design2").load_plan()
+        plan = CampaignSettings(vut="design2", levels=(0,), scenario=US23).load_plan()
         episodes = simulate(plan.with_engine("kinematic"), cases)
 
     Attributes:
@@ -67,9 +67,9 @@ class SimulationPlan:
         criterion: when a case fails.
         against: an earlier version of the VUT, with which each case runs, too.
         engine: moves the vehicles; SUMO in campaigns.
-        corridors: the most episodes at a time in SUMO; decides no outcome.
-        substeps: parts of a step in which vehicles are moved, by eq. (4) without SUMO if it is more
-            than one. Drivers are asked once a step.
+        corridors: how many episodes SUMO runs at once; it does not change their outcomes.
+        substeps: integration steps for each step of the drivers; above 1, eq. (4) alone moves the
+            vehicles.
         versions: those of the software that gives the outcomes; by default of this process.
         policies_sha256: hashes of the learned drivers; by default of those that this process finds.
     """
@@ -182,6 +182,9 @@ class SimulationPlan:
 
     def workers(self, requested: AnyWorkers, cases: int | None = None) -> int | str:
         """Return the number of processes that run cases, or the address of a Dask scheduler.
+
+        With more than one, the processes that loaded the controllers end, because each worker
+        starts its own.
 
         Args:
             requested: the number or the address; None and "auto" for one a core, as far as the

@@ -97,7 +97,7 @@ class MirrorSimulation:
     @property
     def has_lane(self) -> bool:
         """True where the scenario has an acceleration lane."""
-        return self.road.lane_m is not None
+        return self.road.used_lane_m is not None
 
     @property
     def time_s(self) -> float:
@@ -271,7 +271,7 @@ class MirrorSimulation:
         ends, continues = self.road.mainline, self.road.ramp
         if self.road.ramp_approach.yields:
             ends, continues = continues, ends
-        _, end_m = self.road.lane_m or (0.0, 0.0)
+        _, end_m = self.road.used_lane_m or (0.0, 0.0)
         *_, target = filter(lambda piece: piece.start_m < end_m, continues.pieces)
         for name, x_m in self.at_m.items():
             next_m = x_m + (self._libsumo.vehicle.getSpeed(name) + SPEED_MARGIN_MPS) * DT_S

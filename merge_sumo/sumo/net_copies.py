@@ -152,8 +152,8 @@ def _numbered(text: str, copy: int) -> str:
 
 def _hosted_lanes(road: Road) -> tuple[list[_HostedLane], list[_HostedLane]]:
     """Return the lanes of mainline and ramp; where the paths are one they are the same."""
-    main = _lanes_of(road.mainline, "main", road.lane_m, number=1)
-    ramp = _lanes_of(road.ramp, "main" if road.is_one_path else "ramp", road.lane_m, number=0)
+    main = _lanes_of(road.mainline, "main", road.used_lane_m, number=1)
+    ramp = _lanes_of(road.ramp, "main" if road.is_one_path else "ramp", road.used_lane_m, number=0)
     return main, ramp
 
 

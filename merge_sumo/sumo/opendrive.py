@@ -36,7 +36,7 @@ def opendrive(road: Road) -> bytes:
     for connection in net.iterfind("connection"):
         for name in ("tl", "linkIndex", "via"):
             connection.attrib.pop(name, "")
-    if road.lane_m is not None and road.acceleration_lane is not None:
+    if road.used_lane_m is not None and road.acceleration_lane is not None:
         for lane in net.iter("lane"):
             if lane.get("id") in road.acceleration_lane.lanes:
                 lane.set("type", ENTRY)

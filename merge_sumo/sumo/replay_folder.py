@@ -130,7 +130,7 @@ def _road_of_folder(road: Road, folder: Path) -> Road:
     """Return a road with the lanes of the net of a folder."""
     mainline, ramp = _without_limit(road.mainline), _without_limit(road.ramp)
     net = hosted_net(replace(road, mainline=mainline, ramp=ramp), 1, lane_goes_on=True)
-    return road_of_hosted(net, folder / NET, road.lane_m)
+    return road_of_hosted(net, folder / NET, road.used_lane_m)
 
 
 def _without_limit(path: LanePath) -> LanePath:

@@ -6,9 +6,9 @@ step, so eq. (4),
     x(t+1) = x(t) + v(t) dt,    v(t+1) = v(t) + a(t) dt,
 
 is had by stepping at v(t) and then telling SUMO that the speed now is v(t+1). Positions are read
-back from SUMO after every step, and must be those of eq. (4). Speeds are read back where an episode
-begins, and then are those that SUMO was told: a vehicle that did not drive at its speed would show
-in its next position.
+back from SUMO after every step, and must be those of eq. (4). Speeds are read back only where an
+episode begins. After that the commanded ones are taken: a wrong speed would show as a wrong
+position in the next step.
 
 Where SUMO itself drives a vehicle, its car-following model and its junction logic decide v(t+1)
 from the state at t. SUMO then moves by v(t+1) instead of v(t), so the vehicle is put where eq. (4)
@@ -122,7 +122,7 @@ class SumoSimulation:
         """Lane coordinates at which the lanes begin on which the vehicles are."""
         self._by_sumo: NDArray[np.bool_] = np.zeros(shape, dtype=np.bool_)
         """Whether SUMO drives a vehicle; the others hold the speed that they are told."""
-        self._lane_changes = vut_type is not None and self.road.lane_m is not None
+        self._lane_changes = vut_type is not None and self.road.used_lane_m is not None
         """Whether SUMO's lane-change model decides when VUTs merge."""
         self._start()
 
@@ -293,8 +293,8 @@ class SumoSimulation:
         SUMO stops a vehicle that would leave the end of the acceleration lane in a step, so one
         that is forced to merge by that step is moved before it.
         """
-        assert self.road.lane_m is not None, "a road with a lane"  # noqa: S101
-        leaves = x_m + v_mps * DT_S >= self.road.lane_m[1]
+        assert self.road.used_lane_m is not None, "a road with a lane"  # noqa: S101
+        leaves = x_m + v_mps * DT_S >= self.road.used_lane_m[1]
         for k in np.flatnonzero((merged | leaves) & ~self._merged).tolist():
             self._merged[k] = True
             lane, start_m = self._lane_at(VUT, k, float(x_m[k]))

@@ -126,7 +126,7 @@ class TestRoom:
 
 @pytest.mark.parametrize("how", [{"batch": 9}, {"batch": 4}, {"in_flight": 8}])
 def test_every_case_runs_as_often_as_stated_however_batches_are_cut(how):
-    ran = found(make_sampler("coverage", POOL, 1), 26, draws=3, **how)
+    ran = found(make_sampler("coverage", POOL, 1), 26, repeat=3, **how)
     runs = Counter(one.outcome.case.start for one in ran)
     assert list(runs.values()) == [3] * 8 + [2]
     assert [one.outcome.case.draw for one in ran] == [0, 1, 2] * 8 + [0, 1]

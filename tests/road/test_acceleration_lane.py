@@ -35,7 +35,7 @@ def road(tmp_path_factory):
 
 def test_the_shipped_road_has_m_at_a_share_of_035_of_200_m(road):
     us23 = road("us23-lane")
-    assert us23.lane_m == (-70.0, 130.0)
+    assert us23.used_lane_m == (-70.0, 130.0)
     for path, lanes, starts_m in (
         (us23.ramp, ["ramp_0", "lane_0", "main_out_0"], [-425.0, -70.0, 130.0]),
         (us23.mainline, ["main_in_0", "lane_1", "main_out_0"], [-1000.0, -70.0, 130.0]),
@@ -50,7 +50,7 @@ class TestTheWindow:
     @pytest.mark.parametrize("name", LANES)
     def test_ends_where_the_scenario_says_and_begins_at_the_gore(self, road, name):
         own = road(name)
-        begin_m, end_m = own.lane_m
+        begin_m, end_m = own.used_lane_m
         assert end_m == LANE_M[1]
         for path in (own.mainline, own.ramp):
             assert {begin_m, end_m} <= set(path.starts_m)

@@ -107,7 +107,7 @@ class TestAnExport:
     @pytest.mark.parametrize("name", LANES)
     def test_to_opendrive_has_both_lanes_of_a_merge(self, tmp_path, name):
         road = foreign_lane_road(name, tmp_path)
-        begin_m, end_m = road.lane_m
+        begin_m, end_m = road.used_lane_m
         (tmp_path / "road.xodr").write_bytes(opendrive(road))
         centres = lane_centres(tmp_path / "road.xodr")
         for on_ramp in (False, True):

@@ -68,7 +68,7 @@ def test_a_lane_change_anywhere_on_an_acceleration_lane_is_a_merge_request(name,
     road = foreign_lane_road(name, tmp_path)
     session = Session(mirror(tmp_path, replace(US23, lane_m=LANE_M), road))
     vehicle, v_mps = ToSession(session).vehicle, 15.0
-    begin_m, end_m = road.lane_m or (0.0, 0.0)
+    begin_m, end_m = road.used_lane_m or (0.0, 0.0)
     for merges_m in (begin_m + 1.0, (begin_m + end_m) / 2.0, end_m - 8.0, None):
         x_m, merged = begin_m - 20.0, False
         session.enter({"pov": (x_m - 90.0, v_mps, 0.0), "vut": (x_m, v_mps, 0.0)})

@@ -106,7 +106,7 @@ def test_a_merge_from_a_lane_is_seen_in_the_row_in_which_it_happens(tmp_path, na
         road = road_for(scenario)
     else:
         scenario, road = replace(US23, lane_m=LANE_M), foreign_lane_road(name, tmp_path)
-    begin_m, end_m = road.lane_m
+    begin_m, end_m = road.used_lane_m
     place_m = {"gore": max(begin_m, -198.0), "lane": 21.0, "end": end_m}[place]
     steps = int(np.ceil((place_m + 201.0) / 2.0))
     case = Case(level=0, x_pov0_m=-231.0, v_pov0_mps=20.0, v_vut0_mps=20.0, scenario=scenario)
