@@ -105,7 +105,7 @@ R = TypeVar("R")
 
 
 def verb(config: Callable[P, C]) -> Callable[[Callable[[C], R]], Callable[P, R]]:
-    """Decorate a function of one config, so that callers pass the fields of the config as arguments.
+    """Decorate a function of one config, so that callers pass the fields of that as arguments.
 
     Args:
         config: dataclass of the fields

@@ -123,8 +123,8 @@ class Search:
     instead of batches: for controllers that take seconds for a case. About three times the
     workers."""
     repeat: int = 1
-    """Number of runs of each case. They differ by the seed that `reset` of a controller gets, and
-    by the noise and dropouts of --sense; else all are alike. Each run is one of the --cases."""
+    """Number of runs of each case. They differ by the seed that a controller gets, and by the noise
+    and dropouts of --sense; else all are alike. Each run is one of the --cases."""
     tolerated: float = 0.0
     """A case fails where more than this share of its runs do."""
     seed: int = 0

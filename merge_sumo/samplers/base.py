@@ -23,9 +23,9 @@ class Sampler(ABC):
     matters. A campaign resumes by telling the outcomes of its journal to a new sampler.
 
     A new sampler implements `ask`, or as a `LevelwiseSampler` only `propose`. It may call
-    `history`, `pending`, `observed`, `proposed`, `shares` and `rng`. For each batch a campaign calls
-    `batch_size`, `ask`, `prediction` of each case and `set_pending`; once the batch has run, `tell`
-    and `set_pending`.
+    `history`, `pending`, `observed`, `proposed`, `shares` and `rng`. For each batch a campaign
+    calls `batch_size`, `ask`, `prediction` of each case and `set_pending`; once the batch has run,
+    `tell` and `set_pending`.
 
     Attributes:
         about: what it does, in a line without a full stop, for help and documentation.
