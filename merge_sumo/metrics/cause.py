@@ -179,9 +179,7 @@ def _course(outcome: Outcome, trajectory: Trajectory | None) -> str:
     if found.end is End.TIMEOUT:
         return text + message_of(outcome)
     reaches = "reaches M"
-    if found.lane_share is not None and found.lane_share >= 1.0:
-        reaches = "merges where the lane ends"
-    elif found.lane_share is not None:
+    if found.lane_share is not None:
         reaches = f"merges at {found.lane_share:.2f} of the lane"
     side = "ahead of" if found.merged_first == "VUT" else "behind"
     apart = f"{abs(found.dx_m or 0.0):.1f} m {side} that of the {car}"

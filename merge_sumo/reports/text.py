@@ -172,10 +172,8 @@ def change_in_words(case: ComparedCase) -> str:
     # Equal words do not show the change: add the margins where both may pass, else the verdicts.
     if words[0] == words[1] and case.change is not Change.BOTH:
         for place, outcome in enumerate((case.earlier, case.later)):
-            if case.change in (Change.WORSE, Change.NOT_REPEATABLE):
+            if outcome.margin is not None:
                 words[place] += f", margin {short(outcome.margin)}"
-            else:
-                words[place] += ", no failure" if outcome.passes else ", a failure"
     return " -> ".join(words)
 
 

@@ -54,7 +54,7 @@ ERROR = outcome(None, None, End.VUT_ERROR)
         (CONTACT, TIMEOUT, Change.NEITHER, "contact -> timeout"),
         (SAFE, HARSH, Change.BOTH, "safe -> harsh"),
         # Bodies still touch, although the criterion is met.
-        (CONTACT, TOUCHES, Change.STILL_CONTACT, "contact, a failure -> contact, no failure"),
+        (CONTACT, TOUCHES, Change.STILL_CONTACT, "contact, margin -0.2 -> contact, margin 0.96"),
     ],
 )
 def test_the_change_of_a_case(before, after, change, words):

@@ -153,26 +153,23 @@ def check_cause(text: str, outcome: Outcome, motion: Motion) -> None:
         return
     found = re.fullmatch(
         rf"([A-Za-z ]+)(?:, (contact|conflict))?(?: at a relative speed of {NUMBER} m/s)?: "
-        rf"{CONDUCT} (?:reaches M|merges (where the lane ends|at {NUMBER} of the lane)) "
+        rf"{CONDUCT} (?:reaches M|merges at {NUMBER} of the lane) "
         rf"at {NUMBER} s, its front bumper {NUMBER} m (ahead of|behind) that of the POV\."
         r"(?: (.+)\.)?",
         text,
     )
     assert found is not None, text
-    head, severity, _, vut, pov, where, share, at, apart, side, avoided = found.groups()
+    head, severity, _, vut, pov, share, at, apart, side, avoided = found.groups()
     head = head[0].lower() + head[1:]
     assert (vut, pov) == (motion.conduct(motion.vut), motion.conduct(motion.pov))
     assert motion.arrived
     near(at, motion.end_s)
     near(apart, abs(motion.dx))
     assert (side == "ahead of") == (motion.dx < 0.0)
-    assert (where is None) == (motion.lane_m is None)
+    assert (share is None) == (motion.lane_m is None)
     if motion.lane_m is not None:
         begin_m, end_m = motion.lane_m
-        merged_at = (motion.place_m - begin_m) / (end_m - begin_m)
-        assert (share is None) == (merged_at >= 1.0)
-        if share is not None:
-            near(share, merged_at, 2)
+        near(share, (motion.place_m - begin_m) / (end_m - begin_m), 2)
     assert (abs(motion.dx) < NEAR_M) == (severity is not None) == (avoided is not None)
     if avoided is not None:
         check_kind(head, motion)
