@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from merge_sumo.campaigns.recorded import (
     FILES,
     TALLIES,
     RecordedCampaign,
+    has_converged,
     spread_failures,
 )
 from merge_sumo.campaigns.repeatability import check_repeatability
@@ -104,6 +106,7 @@ def run_campaign(
             for callback in callbacks:
                 callback(stored)
 
+        stop = partial(has_converged, tolerated=settings.tolerated)
         loop = SearchLoop(
             _sampler(settings, plan),
             plan,
@@ -112,7 +115,7 @@ def run_campaign(
             batch=settings.batch,
             repeat=settings.repeat,
             in_flight=settings.in_flight or 0,
-            stop=settings.stopping_rule(),
+            stop=stop if settings.stop_when_converged else None,
             history=history,
         )
         loop.run(on_batches)

@@ -13,7 +13,6 @@ from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, fields, replace
-from itertools import groupby
 from pathlib import Path
 from typing import Annotated, Any, Final, TypeVar
 
@@ -31,7 +30,7 @@ from merge_sumo.metrics.summary import RunsOfCase, failing_cases, one_per_case
 from merge_sumo.printable import counted, printable
 from merge_sumo.records import RecordError, convert, decode, read_arrays
 from merge_sumo.scenario.case import FloatArray, to_unit
-from merge_sumo.scenario.scenario import ALL_LEVELS, DT_S, US23, Scenario
+from merge_sumo.scenario.scenario import ALL_LEVELS, DT_S, Scenario
 from merge_sumo.scenario.signals import SignalRuns, Signals, from_runs
 from merge_sumo.scenario.trajectory import Trajectory, cut_at
 
@@ -69,16 +68,22 @@ ControllerText = Annotated[
 
 
 @dataclass(frozen=True, kw_only=True)
-class RecordedSettings(Search):
-    """The part of `campaign.json` that a reader needs; a missing key has its default."""
+class SharedSettings(Search):
+    """The settings of a campaign that whoever reads its folder needs, too."""
 
-    vut: ControllerText = "None"
+    vut: ControllerText
     levels: tuple[Annotated[int, Meta(ge=min(ALL_LEVELS), le=max(ALL_LEVELS))], ...] = ()
     cases: int = MOST_CASES
     pov: ControllerText | None = None
     against: ControllerText | None = None
     fail_when: str = PAPER_CRITERION.fail_when
     require: str | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class RecordedSettings(SharedSettings):
+    """The part of `campaign.json` that a reader needs; a missing key has its default."""
+
     ran_again: int = 0
     in_vain: dict[str, int] = field(default_factory=dict)
     net_sha256: str | None = None
@@ -173,18 +178,6 @@ class RecordedCampaign:
         """Whether the search ended before its number of cases, as little new was found."""
         may_stop = self.settings.stop_when_converged and len(self.outcomes) < self.settings.cases
         return may_stop and has_converged(self.outcomes, self.tolerated)
-
-    @property
-    def simulated_s(self) -> float:
-        """Simulated time of all cases with the follow-up; without it where the motion is lost."""
-        steps = 0
-        for batch, group in groupby(self.outcomes, key=lambda outcome: outcome.batch):
-            try:
-                rows = read_arrays(batch_file(self.folder, batch), "rows")["rows"]
-                steps += int((rows - 1).sum())
-            except RecordError:
-                steps += sum(round(one.measures.t_end_s / DT_S) for one in group)
-        return round(steps * DT_S, 1)
 
     @property
     def interruption(self) -> str:
@@ -358,9 +351,8 @@ def recorded_scenario(settings: Mapping[str, Any], path: Path) -> Scenario:
     Raises:
         UserError: the scenario is not one.
     """
-    recorded = settings.get("scenario")
     with explained(f"{path} has no scenario"):
-        return US23 if recorded is None else convert(recorded, Scenario)
+        return convert(settings.get("scenario", {}), Scenario)
 
 
 def read_outcomes(text: bytes, name: str, scenario: Scenario) -> tuple[list[Outcome], bool]:

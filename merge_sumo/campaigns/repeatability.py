@@ -62,7 +62,7 @@ class SecondRun(Record, frozen=True, forbid_unknown_fields=False):
 
 def check_repeatability(
     run: RecordedCampaign, settings: CampaignSettings, plan: SimulationPlan, workers: Workers
-) -> list[SecondRun]:
+) -> None:
     """Run some cases of a campaign again, and write the comparison to `repeats.jsonl`.
 
     Cases that end in an error now are left out.
@@ -72,13 +72,10 @@ def check_repeatability(
         settings: its settings.
         plan: how its cases run.
         workers: where they run.
-
-    Returns:
-        A comparison for each case, by index.
     """
     outcomes = cases_to_repeat(run.outcomes, settings)
     if not outcomes:
-        return []
+        return
     second_runs = []
     cases = [outcome.case for outcome in outcomes]
     job = workers.submit(
@@ -89,7 +86,6 @@ def check_repeatability(
             second_runs.append(second_run_of(outcome, run.trajectory(outcome.index), episode))
     second_runs.sort(key=lambda second: second.index)
     replace_own(run.folder / REPEATS, b"".join(map(to_json, second_runs)), b'"index"')
-    return second_runs
 
 
 def cases_to_repeat(outcomes: Sequence[Outcome], settings: CampaignSettings) -> list[Outcome]:

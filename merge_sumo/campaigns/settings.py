@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import MISSING, dataclass, fields, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,18 +11,16 @@ from merge_sumo.campaigns.printed_commands import CONTROLLERS
 from merge_sumo.campaigns.recorded import (
     NAME_CHARACTERS,
     SETTINGS,
-    ControllerText,
-    has_converged,
+    SharedSettings,
     recorded_scenario,
 )
-from merge_sumo.config import MOST_CASES, Search, non_defaults
+from merge_sumo.config import Search, non_defaults
 from merge_sumo.controllers.in_memory import names_code
 from merge_sumo.controllers.kinds import is_built_in, load, waits_for_client
 from merge_sumo.controllers.spec import ControllerOptions
 from merge_sumo.drivers.policies import policies_name
 from merge_sumo.errors import UserError
-from merge_sumo.metrics.criterion import PAPER_CRITERION, Criterion
-from merge_sumo.metrics.outcome import Outcome
+from merge_sumo.metrics.criterion import Criterion
 from merge_sumo.metrics.summary import check_tolerated
 from merge_sumo.printable import printable
 from merge_sumo.records import RecordError, check_fields, to_plain
@@ -32,12 +29,10 @@ from merge_sumo.samplers.base import Predictor, Sampler
 from merge_sumo.samplers.registry import SAMPLERS, make_sampler
 from merge_sumo.scenario.case import Pool
 from merge_sumo.scenario.scenario import (
-    ALL_LEVELS,
     DEADLINE_S,
     MEMORY_GIB,
     OWN,
     Scenario,
-    level_name,
 )
 from merge_sumo.simulation.plan import SimulationPlan
 from merge_sumo.simulation.povs import POLICIES, Povs, check_level, own_pov, policies_folder
@@ -47,7 +42,7 @@ DEBUG_DEADLINE_S = 86_400.0
 
 
 @dataclass(frozen=True, kw_only=True)
-class CampaignSettings(Search):
+class CampaignSettings(SharedSettings):
     """Everything that decides the outcomes of a campaign; `UserError` for wrong values.
 
     Example:
@@ -67,13 +62,6 @@ class CampaignSettings(Search):
         vut_memory_gib: memory that the process of a controller may take, in GiB.
     """
 
-    vut: ControllerText
-    levels: tuple[int, ...]
-    cases: int = MOST_CASES
-    pov: ControllerText | None = None
-    against: ControllerText | None = None
-    fail_when: str = PAPER_CRITERION.fail_when
-    require: str | None = None
     scenario: Scenario
     policies: str | None = None
     deadline_s: float = DEADLINE_S
@@ -102,10 +90,6 @@ class CampaignSettings(Search):
             number = getattr(self, name)
             if number is not None and number < 1:
                 raise UserError(f"`{name}` is {number}: it must be 1 or more")
-            if number is not None and number > self.cases:
-                raise UserError(
-                    f"`{name}` is {number} and `cases` is {self.cases}: it cannot be more"
-                )
         self._check_levels()
         if self.in_flight is not None:
             self._check_in_flight()
@@ -117,9 +101,6 @@ class CampaignSettings(Search):
     def _check_levels(self) -> None:
         if not self.levels or len(set(self.levels)) < len(self.levels):
             raise UserError(f"the levels are {list(self.levels)}: name each level once")
-        if not set(self.levels) <= set(ALL_LEVELS):
-            known = ", ".join(map(level_name, ALL_LEVELS))
-            raise UserError(f"the levels are {list(self.levels)}: choose from {known}")
         if OWN in self.levels and self.pov is None:
             raise UserError("level own needs a POV of your own: name one as `pov`")
 
@@ -159,12 +140,6 @@ class CampaignSettings(Search):
         if self.against is None:
             raise UserError("the campaign is against no earlier version")
         return replace(self, vut=self.against, against=None)
-
-    def stopping_rule(self) -> Callable[[Sequence[Outcome]], bool] | None:
-        """Return a function of all outcomes that ends the search; None without one."""
-        if not self.stop_when_converged:
-            return None
-        return partial(has_converged, tolerated=self.tolerated)
 
     def new_sampler(self, predictor: Predictor | None = None) -> Sampler:
         """Return the sampler, without outcomes.

@@ -18,7 +18,6 @@ from merge_sumo.analysis.stress import STRESS
 from merge_sumo.campaigns.recorded import (
     OUTCOMES,
     SETTINGS,
-    TRAJECTORIES,
     RecordedCampaign,
     failures,
 )
@@ -229,8 +228,8 @@ def _repeats(run: RecordedCampaign) -> Facts:
 
 
 def _motion(run: RecordedCampaign, undecided: frozenset[int], failing: str) -> Facts:
-    key = f"t_end_s; the follow-up by {TRAJECTORIES}/"
-    yield Fact("simulated time", run.simulated_s / 3600.0, key, "h")
+    simulated_s = sum(outcome.measures.t_end_s for outcome in run.outcomes)
+    yield Fact("simulated time up to M", simulated_s / 3600.0, "t_end_s", "h")
     failed = failures(run.cases)
     if not failed:
         return

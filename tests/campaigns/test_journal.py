@@ -125,7 +125,7 @@ class TestAJournal:
         }
 
     def test_syncs_the_trajectories_before_the_outcomes(self, tmp_path, monkeypatch):
-        journal = Journal.create(tmp_path / "run", {})
+        journal = Journal.create(tmp_path / "run", {"vut": "v"})
         synced, fsync = [], os.fsync
 
         def note(file: int) -> None:
@@ -141,7 +141,7 @@ class TestAJournal:
 
     @pytest.mark.parametrize("most", [1_000, 12_000], ids=["trajectories", "outcomes"])
     def test_takes_back_what_it_wrote_when_the_rest_does_not_fit(self, tmp_path, most):
-        with Journal.create(tmp_path / "run", {}) as journal:
+        with Journal.create(tmp_path / "run", {"vut": "v"}) as journal:
             journal.append([episode(0, 0, steps=2)])
             before = (tmp_path / "run" / "outcomes.jsonl").read_bytes()
             batch = [episode(index, 1, steps=2) for index in range(1, 41)]
@@ -164,7 +164,7 @@ class TestAJournal:
 class TestARun:
     @pytest.fixture
     def folder(self, tmp_path):
-        journal = Journal.create(tmp_path / "run", {"levels": [0]})
+        journal = Journal.create(tmp_path / "run", {"vut": "v", "levels": [0]})
         journal.append([episode(0), episode(1)])
         journal.append([episode(2, 1)])
         return tmp_path / "run"
