@@ -84,7 +84,7 @@ from merge_sumo.reports.progress import Bars, CampaignBars
 from merge_sumo.reports.report import RunningReport, check_report, write_report
 from merge_sumo.result import Shown
 from merge_sumo.road.scenario_file import SUFFIX
-from merge_sumo.scenario.scenario import LEVELS, US23, AnyLevels, Scenario, level_name
+from merge_sumo.scenario.scenario import US23, Scenario, level_name
 from merge_sumo.simulation.evaluate import simulate
 from merge_sumo.simulation.plan import Engine, SimulationPlan
 from merge_sumo.simulation.povs import parse_levels, policies_folder
@@ -164,7 +164,7 @@ def campaign(config: c.Campaign) -> CampaignRun:
     settings = settings_from_config(config)
     folder = dated(settings.vut) if config.out is None else Path(config.out)
     plan = settings.load_plan()
-    notice_povs(settings, plan, config.level)
+    notice_povs(settings, plan)
     check_new(folder)
     return run_and_report(settings, plan, folder, config)
 
@@ -612,19 +612,13 @@ def run_and_report(
     return result
 
 
-def notice_povs(settings: CampaignSettings, plan: SimulationPlan, level: AnyLevels) -> None:
-    """Warn with a `Notice` of POVs that are missing, or not trained on the scenario.
+def notice_povs(settings: CampaignSettings, plan: SimulationPlan) -> None:
+    """Warn with a `Notice` of POVs that were not trained on the scenario.
 
     Args:
         settings: the settings of a new campaign.
         plan: how its cases run.
-        level: the levels as its user has named them.
     """
-    if level == "all" and not set(LEVELS) <= set(settings.levels):
-        present = ", ".join(map(level_name, settings.levels))
-        notice(
-            f"`level` all: policies are there for level {present}; `merge-sumo train` makes others"
-        )
     if {1, 2} & set(settings.levels) and unseen(settings.scenario, plan.povs.policies):
         notice(
             f"the POVs of levels 1 and 2 were not trained on {settings.scenario.name}: "

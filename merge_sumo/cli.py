@@ -277,11 +277,8 @@ def _coordinates(words: Sequence[str]) -> dict[str, float]:
     values: dict[str, float] = {}
     for text in words:
         name, _, number = text.partition("=")
-        name = name.strip()
-        if name in values:
-            raise UserError(f"--at has {name} twice: give the coordinate once")
         try:
-            values[name] = float(number)
+            values[name.strip()] = float(number)
         except ValueError:
             raise UserError(f"--at {text}: give NAME=NUMBER, as x_pov0_m=-250") from None
     return values

@@ -100,12 +100,6 @@ class Registry(Mapping[str, T], Generic[T]):
             ) from error
         if not self._accepts(item):
             raise UserError(f"the {self.noun} {name!r} of {package} is not {self._contract}")
-        own = getattr(item, "name", name)
-        if isinstance(own, str) and own != name:
-            raise UserError(
-                f"the {self.noun} {name!r} of {package} names itself {own!r}: register it by that "
-                "name"
-            )
         return item
 
 

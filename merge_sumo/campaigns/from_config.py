@@ -159,8 +159,8 @@ def _case(scenario: Scenario, level: int, values: Mapping[str, Any]) -> Case:
         known.add(dimension.field)
         if values.get(dimension.field) is None:
             raise UserError(
-                f"{_option(dimension.field)} is missing: the pool has {dimension.low:g} to "
-                f"{dimension.high:g}"
+                f"`{dimension.field}` is missing: name it, or give it by `at`; the pool has "
+                f"{dimension.low:g} to {dimension.high:g}"
             )
     numbers: dict[str, Any] = {}
     if isinstance(scenario.v_vut0_mps, float):
@@ -168,7 +168,7 @@ def _case(scenario: Scenario, level: int, values: Mapping[str, Any]) -> Case:
     for name, value in values.items():
         if name not in known:
             raise UserError(
-                f"{_option(name)} is not a coordinate of {scenario.name} at level "
+                f"`{name}` is not a coordinate of {scenario.name} at level "
                 f"{level_name(level)}: leave it out, or name {either(sorted(known))}"
             )
         if value is not None:
@@ -182,8 +182,3 @@ def _number(name: str, value: Any) -> float:
         return float(value)
     except (TypeError, ValueError):
         raise UserError(f"{name} is {value!r:.60}: it must be a number") from None
-
-
-def _option(name: str) -> str:
-    """Return how a user gives a coordinate."""
-    return f"`{name}`" if name in c.COORDINATES else f"`at` {name}=NUMBER"

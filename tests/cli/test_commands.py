@@ -66,7 +66,6 @@ class TestOptions:
             (["campaign", "--cases", "few"], "--cases"),
             (["campaign", "--seed", "1", "--seed", "2"], "--seed specified multiple times"),
             (["run", "--at", "x_pov0_m"], "give NAME=NUMBER"),
-            (["run", "--at", "x_pov0_m=1", "x_pov0_m=2"], "x_pov0_m twice"),
             (["vuts", "so", "many"], "too many arguments: so many"),
             (["campaign", "design1", "--fail-when", "-x < 3"], "-x is neither a measure"),
             (["campaign", "--no-such-option", "3"], "--no-such-option"),

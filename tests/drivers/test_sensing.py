@@ -177,7 +177,7 @@ class TestSettings:
         assert str(error.value).startswith(said)
 
     def test_of_a_range_need_a_number_in_a_case(self):
-        with pytest.raises(UserError, match="`at` sense_delay_s=NUMBER is missing"):
+        with pytest.raises(UserError, match="`sense_delay_s` is missing"):
             ms.run("design2", x_pov0_m=-250.0, v_pov0_mps=29.0, sense="delay_s=0..1")
-        with pytest.raises(UserError, match="`at` sense_delay_s=NUMBER is not a coordinate"):
+        with pytest.raises(UserError, match="`sense_delay_s` is not a coordinate"):
             ms.run("design2", at={"sense_delay_s": 0.1}, x_pov0_m=-250.0, v_pov0_mps=29.0)
