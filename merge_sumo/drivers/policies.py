@@ -24,8 +24,6 @@ PLAYED = (
     *("level0_a_mps2", "level0_v_mps", "timeout_s"),
 )
 """Numbers of a scenario that decide the training of a driver; the road and other cars do not."""
-LIMITS = ("reach_m", "v_start_max_mps")
-"""Numbers of a scenario that limit the others."""
 MOST_BYTES = 1 << 26
 """Largest size of a network, and of a manifest."""
 
@@ -127,7 +125,7 @@ def scenario_record(scenario: Scenario) -> dict[str, Any]:
         scenario: the scenario.
     """
     record = to_plain(scenario)
-    return {name: record[name] for name in ("name", *PLAYED, *LIMITS)}
+    return {name: record[name] for name in ("name", *PLAYED, "reach_m", "v_start_max_mps")}
 
 
 def scenario_of(entry: dict[str, Any]) -> Scenario:

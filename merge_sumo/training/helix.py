@@ -105,8 +105,8 @@ def train_library(
     scenario = of_two(scenario)
     if a_min_mps2 is not None and not scenario.a_min_mps2 <= a_min_mps2 < 0.0:
         raise UserError(
-            f"the hardest braking of a POV is {a_min_mps2:g} m/s2: choose a number from "
-            f"{scenario.a_min_mps2:g} to below 0, such as `a_min` {scenario.a_min_mps2 / 2:g}"
+            f"the hardest braking of a POV is {a_min_mps2:g} m/s2: choose with `a_min` a "
+            f"number from {scenario.a_min_mps2:g} to below 0"
         )
     road_for(scenario)  # the check needs it in the end
     _make_library(folder)

@@ -276,7 +276,7 @@ class TestTraining:
 
 @pytest.mark.parametrize("a_min_mps2", [0.0, -4.5, float("nan")])
 def test_a_limit_outside_that_of_the_scenario_is_refused(tmp_path, a_min_mps2):
-    with pytest.raises(UserError, match="choose a number from -4 to below 0"):
+    with pytest.raises(UserError, match="choose with `a_min` a number from -4 to below 0"):
         train_library(tmp_path / "new", scenario=US23, a_min_mps2=a_min_mps2)
     assert not (tmp_path / "new").exists()
 
