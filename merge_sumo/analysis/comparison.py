@@ -336,18 +336,18 @@ def compare(runs: Sequence[RecordedCampaign]) -> Comparison:
         The comparison, with the changes from each campaign to the next.
 
     Raises:
-        UserError: for fewer than two campaigns, and where they differ in the scenario, the
-            criterion or, at a level, the POV.
+        UserError: for fewer than two campaigns, where one has no level in common with the next,
+            and where they differ in the scenario, the criterion or, at a level, the POV.
     """
     if len(runs) < 2:
         raise UserError("a comparison needs two campaigns or more: name the older one first")
     for run in runs[1:]:
         _check_comparable(runs[0], run)
     versions = list(map(Version.of, runs))
-    if not versions[0].summary.levels.keys() & versions[1].summary.levels.keys():
-        raise UserError(f"{runs[0].folder} and {runs[1].folder} have no POV level in common")
     changes = []
     for number, (earlier, later) in enumerate(pairwise(versions), start=2):
+        if not earlier.summary.levels.keys() & later.summary.levels.keys():
+            raise UserError(f"{earlier.folder} and {later.folder} have no POV level in common")
         changes.append(_version_change(number, earlier, later))
     notes = []
     if len({(run.settings.sampler, run.settings.cases) for run in runs}) > 1:

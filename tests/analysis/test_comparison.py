@@ -144,7 +144,7 @@ def test_what_does_not_compare_is_refused(tmp_path, run):
     with pytest.raises(UserError, match="needs two campaigns or more"):
         compare([run])
     with pytest.raises(UserError, match="no POV level in common"):
-        compare([run, write(tmp_path / "1", (0.1, 0.1, "passes"), level=1)])
+        compare([run, run, write(tmp_path / "1", (0.1, 0.1, "passes"), level=1)])
     with pytest.raises(UserError, match="differ in the share of its runs"):
         compare([run, changed(tmp_path / "tolerant", run, tolerated=0.2)])
 
