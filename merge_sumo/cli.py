@@ -21,7 +21,6 @@ from cyclopts import App, CycloptsError, Group, Parameter, Token, UnusedCliToken
 import merge_sumo as ms
 from merge_sumo import config as c
 from merge_sumo.console import (
-    flag_of,
     notices_printed,
     prepare_streams,
     print_json,
@@ -156,7 +155,7 @@ app = Commands(
     group_parameters=OPTIONS,
     default_parameter=Parameter(
         negative=(),
-        name_transform=lambda name: flag_of(name).removeprefix("--"),
+        name_transform=lambda name: c.flag_of(name).removeprefix("--"),
     ),
     config=use_all_cores,
     result_action="return_value",

@@ -1,7 +1,7 @@
 """Settings of the verbs: one dataclass each, whose fields are keywords in Python and options.
 
 Shared fields stand in base classes. `None` means: as in the scenario; for a recorded campaign: as
-it was recorded. An option has the name of its field, unless `console.FLAGS` gives another.
+it was recorded. An option has the name of its field, unless `FLAGS` gives another.
 
 A field of `ScenarioChanges` has the name of a field of `Scenario`, which it replaces
 (`from_config.scenario_from`). One of `Search`, `FailureRule` or `Limits` is a field of
@@ -43,6 +43,32 @@ else:  # Types of the values that a command line has; the others take time to im
 
 MOST_CASES = 800
 """Maximum number of cases of a campaign that ends when its search has converged."""
+FLAGS: Mapping[str, str] = {
+    "deadline_s": "--deadline",
+    "vut_memory_gib": "--vut-memory",
+    "follow_up_s": "--follow-up",
+    "from_s": "--from",
+    "x_pov0_m": "--x",
+    "v_pov0_mps": "--v",
+    "svo_rad": "--psi",
+    "headway_ahead_s": "--headway-ahead",
+    "headway_behind_s": "--headway-behind",
+    "recorded": "--case",
+    "tolerated": "--tolerate",
+    "gates": "--gate",
+    "params": "--param",
+    "file_format": "--format",
+}
+"""Options with another name than their field."""
+
+
+def flag_of(name: str) -> str:
+    """Return the option of the command line for a field.
+
+    Args:
+        name: name of the field.
+    """
+    return FLAGS.get(name, f"--{name.replace('_', '-')}")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -303,7 +329,7 @@ class CaseOptions(Beginning, Test):
     """A campaign, or its folder, and the index of its case: default of everything else."""
 
 
-COORDINATES = ("x_pov0_m", "v_pov0_mps", "svo_rad", "headway_ahead_s", "headway_behind_s")
+COORDINATE_OPTIONS = ("x_pov0_m", "v_pov0_mps", "svo_rad", "headway_ahead_s", "headway_behind_s")
 """Fields of `CaseOptions` that are coordinates of a case."""
 
 

@@ -9,7 +9,7 @@ import re
 import signal
 import sys
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import fields, is_dataclass
 from functools import cache
@@ -23,33 +23,6 @@ from merge_sumo.printable import printable
 
 if TYPE_CHECKING:
     from merge_sumo.result import Result
-
-FLAGS: Mapping[str, str] = {
-    "deadline_s": "--deadline",
-    "vut_memory_gib": "--vut-memory",
-    "follow_up_s": "--follow-up",
-    "from_s": "--from",
-    "x_pov0_m": "--x",
-    "v_pov0_mps": "--v",
-    "svo_rad": "--psi",
-    "headway_ahead_s": "--headway-ahead",
-    "headway_behind_s": "--headway-behind",
-    "recorded": "--case",
-    "tolerated": "--tolerate",
-    "gates": "--gate",
-    "params": "--param",
-    "file_format": "--format",
-}
-"""Options with another name than their field."""
-
-
-def flag_of(name: str) -> str:
-    """Return the option of the command line for a field.
-
-    Args:
-        name: name of the field.
-    """
-    return FLAGS.get(name, f"--{name.replace('_', '-')}")
 
 
 def prepare_streams() -> None:
@@ -109,7 +82,7 @@ def _with_flags(sentence: str) -> str:
     """Return a sentence of the package with options in the place of keywords in backticks."""
 
     def in_place(keyword: re.Match[str]) -> str:
-        return flag_of(keyword[1]) if keyword[1] in _field_names() else keyword[0]
+        return config.flag_of(keyword[1]) if keyword[1] in _field_names() else keyword[0]
 
     return re.sub(r"`(\w+)`", in_place, sentence)
 

@@ -145,7 +145,7 @@ def planned_case(config: c.RunCase, run: RecordedCampaign | None) -> tuple[Campa
     values = {}
     for dimension in settings.scenario.dimensions(level):
         values[dimension.field] = row.get(dimension.field)
-    for name in c.COORDINATES:
+    for name in c.COORDINATE_OPTIONS:
         if getattr(config, name) is not None:
             values[name] = getattr(config, name)
     case = _case(settings.scenario, level, values | dict(config.at or {}))

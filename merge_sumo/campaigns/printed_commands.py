@@ -12,6 +12,7 @@ from keyword import iskeyword
 from pathlib import Path
 from typing import Any
 
+from merge_sumo.config import flag_of
 from merge_sumo.controllers.kinds import parse, runs_code
 from merge_sumo.controllers.python import object_of
 from merge_sumo.controllers.signatures import is_code
@@ -63,15 +64,15 @@ def command(verb: str, *arguments: Argument, **options: Argument | None) -> str:
     if any(spec.kind == HERE for spec in specs):
         return call(verb, *arguments, **given)
     name, *option = OPTIONS.get(verb if arguments else "", (verb,))
-    words = ["merge-sumo", name, *map(_flag, option)]
+    words = ["merge-sumo", name, *map(flag_of, option)]
     for argument in arguments:
         words += _words(argument)
     for name, value in given.items():
         if value is True:
-            words.append(_flag(name))
+            words.append(flag_of(name))
             continue
         for word in _words(value):
-            words += [_flag(name), word]
+            words += [flag_of(name), word]
     return " ".join(words)
 
 
@@ -90,10 +91,6 @@ def call(verb: str, *arguments: Argument, **options: Argument) -> str:
         expression = _controller(str(value)) if name in CONTROLLERS else _expression(value)
         parts.append(f"{name}={expression}")
     return f"ms.{verb}({', '.join(parts)})"
-
-
-def _flag(name: str) -> str:
-    return "--gate" if name == "gates" else f"--{name.replace('_', '-')}"
 
 
 def _words(argument: Argument) -> Iterator[str]:

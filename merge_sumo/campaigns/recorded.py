@@ -141,8 +141,8 @@ class RecordedCampaign:
             text = regular(path).read_bytes()
         self.outcomes, self.torn = read_outcomes(text, str(path), self.scenario)
         for outcome in self.outcomes:
-            needs = not (self.criterion.is_of_paper or outcome.measures.end.is_error)
-            if needs == outcome.is_by_score and not self.criterion.uses_score:
+            needs_margin = not (self.criterion.is_of_paper or outcome.measures.end.is_error)
+            if needs_margin == outcome.is_by_score and not self.criterion.uses_score:
                 raise UserError(
                     f"case {outcome.index} in {path} is not judged by the criterion of {SETTINGS}, "
                     f"{self.criterion.as_written}"

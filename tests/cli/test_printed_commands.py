@@ -187,3 +187,7 @@ def test_an_explanation_by_another_vut_names_it(command_line, tmp_path):
     assert said.code == 0, said.err
     assert "  so far design1; with design1?gap_m=30:\n" in said.out
     assert "so far" not in command_line("explain", run.folder).out
+
+
+def test_an_option_has_its_name_of_the_command_line():
+    assert command("rerun", "a", deadline_s=2.0) == "merge-sumo rerun a --deadline 2.0"
