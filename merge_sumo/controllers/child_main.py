@@ -122,12 +122,12 @@ class _Host:
         """Load the controller, then answer request by request."""
         Deadline.before_call = self._beat
         request = HostRequest("make")
-        self._reply(request, self._load)
+        self._answer(request, self._load)
         while request.action != "close":
             request = decode_request(self._connection.recv_bytes())
-            self._reply(request, getattr(self, f"_{request.action}"))
+            self._answer(request, getattr(self, f"_{request.action}"))
 
-    def _reply(self, request: HostRequest, action: Any) -> None:
+    def _answer(self, request: HostRequest, action: Any) -> None:
         process = os.getpid()
         try:
             reply = action(request)

@@ -66,7 +66,7 @@ class ControllerProcess(ChildProcess):
         super().__init__(
             "merge_sumo.controllers.child_main:main", settings, environment, options.log
         )
-        self.loaded = self._opened()
+        self.loaded = self._receive_opening()
 
     def make(self, corridors: int) -> HostReply:
         """Make the controllers of some corridors.
@@ -79,7 +79,7 @@ class ControllerProcess(ChildProcess):
             UserError: if they cannot be made.
         """
         self.send(encode(HostRequest("make", corridors=corridors)))
-        return self._opened()
+        return self._receive_opening()
 
     def request(self, request: HostRequest) -> HostReply:
         """Return the reply to a request.
@@ -92,7 +92,7 @@ class ControllerProcess(ChildProcess):
             UserError: if the request failed, for the controller's reason.
         """
         self.send(encode(request))
-        return self._reply(self._patience_s, self._late)
+        return self._receive_reply(self._patience_s, self._late)
 
     def close(self) -> None:
         """Let the controllers close, then end the process."""
@@ -102,17 +102,17 @@ class ControllerProcess(ChildProcess):
                 self.exit_code()
         self.kill()
 
-    def _opened(self) -> HostReply:
+    def _receive_opening(self) -> HostReply:
         """Return the reply when the controller is loaded or made."""
         try:
-            return self._reply(self._connect_s, f"took longer than {self._connect_s:g} s")
+            return self._receive_reply(self._connect_s, f"took longer than {self._connect_s:g} s")
         except ProcessDiedError as died:
             line = self.output.last_line()
             printed = f" (it printed: {line})" if line else ""
             reason = f"opening the VUT {self._spec} {died}{printed}: look into the VUT"
             raise ProcessDiedError(reason, hung=died.hung) from died
 
-    def _reply(self, patience_s: float, late: str) -> HostReply:
+    def _receive_reply(self, patience_s: float, late: str) -> HostReply:
         reply: HostReply | None = None
         try:
             while reply is None:
@@ -231,7 +231,7 @@ class HostedDriver(ControllerDriver):
         self._kind = kind
         self._starts: list[tuple[int, Start]] = []
         self._files: set[Path] = set()
-        self._process = self._opened()
+        self._process = self._new_process()
 
     def reset(self, corridor: int, start: Start) -> None:
         """Note that an episode begins; the next request has its start.
@@ -256,7 +256,7 @@ class HostedDriver(ControllerDriver):
         self._starts = []
         try:
             if not self._process.alive:
-                self._process = self._opened()
+                self._process = self._new_process()
             reply = self._process.request(request)
         except UserError as error:
             raise EpisodesLostError(str(error)) from None
@@ -286,7 +286,7 @@ class HostedDriver(ControllerDriver):
         """Close the controllers, and end their process."""
         self._process.close()
 
-    def _opened(self) -> ControllerProcess:
+    def _new_process(self) -> ControllerProcess:
         """Return a process in which the controllers are made."""
         process = self._kind.process()
         self._files.update(paths_of(process.loaded))

@@ -30,6 +30,8 @@ Probability = Annotated[float, Meta(ge=0.0, le=1.0)]
 class Prediction(Record, frozen=True):
     """The prediction of a case before it ran: gaps at M and the failure probability.
 
+    A record has it as `foretold`.
+
     Attributes:
         dx_m: signed gaps at M, in m, in one row: one for each member of the model of the
             controller (`twin` in files); None where the VUT never arrived.

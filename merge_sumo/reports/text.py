@@ -19,7 +19,7 @@ from merge_sumo.analysis.comparison import (
 from merge_sumo.analysis.counterfactuals import AVOIDANCE, TAKES_OVER, Avoidance
 from merge_sumo.analysis.explanation import PSI, Axis, Explanation, ExplanationResult
 from merge_sumo.analysis.probability import Estimate, PerMerge, ProbabilityResult
-from merge_sumo.analysis.reproduction import ADAPTIVE, SAMPLERS, Reproduction
+from merge_sumo.analysis.reproduction import ADAPTIVE, PAPER_SAMPLERS, Reproduction
 from merge_sumo.analysis.sampler_study import SamplerStudy, Spread
 from merge_sumo.analysis.stress import StressResult
 from merge_sumo.analysis.truth import DENSE_CASES, REAL_REGION, Truth, TruthResult
@@ -405,7 +405,7 @@ def table_ii(found: Reproduction) -> Iterator[tuple[str, list[str]]]:
 def _fmc_of(study: SamplerStudy) -> dict[str, float | None]:
     """Return the values of a column of Table II by row; None for what is not known."""
     values: dict[str, float | None] = {"truth": study.truth_fmc}
-    for name in SAMPLERS:
+    for name in PAPER_SAMPLERS:
         values[name] = study.samplers[name].fmc.median
     values["dense truth"] = sum(fmc(truth.failures) for truth in study.dense.values()) or None
     values["limit"] = study.limit_fmc

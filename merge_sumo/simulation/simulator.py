@@ -31,7 +31,7 @@ class Simulator:
         vut: drives the VUTs of all corridors.
         pov: drives the cars of the mainline in all corridors.
         in_sumo: indices of the cases of the last `run` that SUMO ran.
-        ran_again: indices of those that ran again, because a process was ended from outside.
+        ran_again: indices of those that ran again after a loss that no case explains.
     """
 
     simulation: SumoSimulation | KinematicSimulation
