@@ -29,7 +29,7 @@ traffic also `ahead` and `behind`) in their present state, and runs as a library
 its own, without a port. merge-sumo itself answers what this SUMO cannot know: the position of a \
 vehicle after the step, and the vehicles that departed and arrived during several steps. A \
 question about an unknown object is refused as by SUMO. Subscriptions to variables of an object \
-are available for all questions, and context subscriptions for what is around a vehicle or a \
+are available for all questions, and context subscriptions for the vehicles around a vehicle or a \
 junction, without filters; they hold until they are ended, \
 whatever their begin and end. `getCollisions` tells of contacts, which change no motion.
 

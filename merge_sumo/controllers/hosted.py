@@ -110,7 +110,7 @@ class ControllerProcess(ChildProcess):
             line = self.output.last_line()
             printed = f" (it printed: {line})" if line else ""
             reason = f"opening the VUT {self._spec} {died}{printed}: look into the VUT"
-            raise ProcessDiedError(reason, hung=died.hung) from died
+            raise ProcessDiedError(reason) from died
 
     def _receive_reply(self, patience_s: float, late: str) -> HostReply:
         reply: HostReply | None = None
@@ -195,8 +195,8 @@ class HostedKind(ControllerKind):
             return process
         try:
             return ControllerProcess(self.spec, self.options, self._kind)
-        except ProcessDiedError as died:
-            if again and not died.hung:
+        except ProcessDiedError:
+            if again:
                 return self.process(again=False)
             raise
 

@@ -181,19 +181,8 @@ BROKEN = "broke the channel to its process"
 class ProcessDiedError(ControllerError):
     """The child process of a controller has ended.
 
-    Attributes:
-        hung: whether it was killed because it sent no reply in time.
+    Its text is a phrase without its subject, as "ended its process with exit code 3".
     """
-
-    def __init__(self, reason: str, *, hung: bool = False) -> None:
-        """Keep how it ended.
-
-        Args:
-            reason: a phrase without its subject, as "ended its process with exit code 3".
-            hung: whether it was killed because it sent no reply in time.
-        """
-        super().__init__(reason)
-        self.hung = hung
 
 
 class ChildProcess(LoggedProcess):
@@ -276,7 +265,7 @@ class ChildProcess(LoggedProcess):
             if self._process.poll() is not None:
                 raise self._died() from None
             self.kill()
-            raise ProcessDiedError(late, hung=True) from None
+            raise ProcessDiedError(late) from None
         except (EOFError, OSError):
             raise self._died() from None
         except BaseException:  # Ctrl-C, too: the answer is awaited no longer

@@ -7,6 +7,7 @@ are put where those of the campaign are.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from lxml import etree
 from merge_sumo.errors import UserError
 from merge_sumo.road.road import LanePath, LanePoint, Road
 from merge_sumo.road.xml_input import harmless_net, to_bytes
-from merge_sumo.scenario.scenario import COLOURS, DT_S, VEHICLES, VUT, Scenario
+from merge_sumo.scenario.scenario import DT_S, VEHICLES, VUT, Scenario
 from merge_sumo.sumo.binding import SPEED_MODE_COMMANDED, SUMO_OPTIONS, load_libsumo
 
 NET = "road.net.xml"
@@ -26,13 +27,9 @@ OPTIONS = (*SUMO_OPTIONS, "--collision.action", "warn")
 """SUMO reports collisions, which change nothing."""
 DEPARTURE_SPEED_MODE = 38
 """Speed mode in which the VUT departs: its limits of acceleration act, SUMO's safety checks not."""
-RGBA = [tuple(bytes.fromhex(f"{COLOURS[name][1:]}ff")) for name in ("pov", "vut")]
-"""Colours of the cars of the mainline, and of the VUT."""
 FASTEST_MPS = 45.0
 """Least maximum speed of a vehicle, where the road allows less; the limit of the shipped road."""
 VUT_ID = VEHICLES[VUT]
-ID_COUNT = 0x01
-"""A variable of every domain."""
 SPEED_MARGIN_MPS = 2.0
 """More than a vehicle gains in a step, unless a controller commands it without any limit."""
 
@@ -85,7 +82,7 @@ class MirrorSimulation:
         )
         files = ("--net-file", str(folder / NET), "--additional-files", str(folder / TYPES))
         self._options = [*files, *OPTIONS]
-        self._started, self._searches = False, 0
+        self._started = False
         self.at_m: dict[str, float] = {}
         self.departed: list[str] = []
         self.arrived: list[str] = []
@@ -150,39 +147,13 @@ class MirrorSimulation:
         Raises:
             RefusedError: if SUMO refuses, or has no such function of these arguments.
         """
-        domain, _, name = function.partition(".")
-        called = getattr(getattr(self._libsumo, domain, None), name, None)
-        if called is None:
-            raise RefusedError(f"SUMO has no {function} here")
         try:
-            return called(*arguments)
+            return attrgetter(function)(self._libsumo)(*arguments)
         except (self._libsumo.TraCIException, self._libsumo.FatalTraCIError) as error:
             raise RefusedError(str(error)) from error
-        except (TypeError, ValueError, OverflowError, NotImplementedError) as error:
+        except (AttributeError, TypeError, ValueError, OverflowError, NotImplementedError) as error:
             given = ", ".join(f"{argument!r:.40}" for argument in arguments)
             raise RefusedError(f"{function} takes no ({given})") from error
-
-    def around(self, point: Sequence[float], domain: int, range_m: float) -> list[str]:
-        """Return the ids of the objects around a point, by a context subscription of a new object.
-
-        Args:
-            point: x and y in m.
-            domain: identifier of the questions of their domain.
-            range_m: largest distance.
-
-        Raises:
-            RefusedError: if SUMO refuses.
-        """
-        self._searches += 1  # an object that has found others keeps them up to the next step
-        name = f"around {self._searches}"
-        self.call("poi.add", name, *point[:2], RGBA[0])
-        try:
-            self.call("poi.subscribeContext", name, domain, range_m, [ID_COUNT])
-            found = set(self.call("poi.getContextSubscriptionResults", name))
-            self.call("poi.unsubscribeContext", name, domain, range_m)
-        finally:
-            self.call("poi.remove", name)
-        return sorted(found - {name})
 
     def enter(self, states: Mapping[str, State]) -> None:
         """Make a step in which the vehicles depart, and put them into their states.
@@ -193,7 +164,6 @@ class MirrorSimulation:
         vehicle, self.merged = self._libsumo.vehicle, False
         for name, state in states.items():
             vehicle.add(name, f"route.{name}", typeID=name, **self._departure(name, state))
-            vehicle.setColor(name, RGBA[name == VUT_ID])
             self.at_m[name] = state[0]
         self.departed += states
         self.step()
@@ -316,8 +286,6 @@ def _types(road: Road, scenario: Scenario) -> bytes:
             "vType",
             id=name,
             length=repr(length_m),
-            width="1.8",
-            height="1.5",
             minGap="0",
             # Where SUMO's models drive the VUT, an episode must not depend on those before it.
             sigma="0",
@@ -325,6 +293,5 @@ def _types(road: Road, scenario: Scenario) -> bytes:
             accel=repr(scenario.a_max_mps2),
             decel=repr(-scenario.a_min_mps2),
             emergencyDecel=repr(-scenario.a_min_mps2),
-            guiShape="passenger/sedan",
         )
     return etree.tostring(root, xml_declaration=True, encoding="UTF-8")

@@ -6,7 +6,6 @@ import importlib
 import inspect
 import sys
 import warnings
-from collections.abc import Callable
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
@@ -15,6 +14,7 @@ from typing import Any
 from merge_sumo.sumo.binding import sumo_program
 
 
+@cache
 def load_traci() -> Any:
     """Return SUMO's own client, which comes with its programs.
 
@@ -27,12 +27,18 @@ def load_traci() -> Any:
     return importlib.import_module("traci")
 
 
-@cache
-def packer() -> Callable[..., bytes]:
-    """Return the function that packs typed values, called with letters of a form and the values."""
+def pack(form: str, *values: Any) -> bytes:
+    """Return values with their types, as SUMO's own client packs them.
+
+    Args:
+        form: a letter for each value: integer (i), double (d), string (s), signed (b) and unsigned
+            byte (B), list of strings (l) or of floats (f), position in the plane (o), in space (O),
+            on earth (g, G) or on a road (r), colour (c), polygon (p).
+        *values: the values.
+    """
     connection = load_traci().connection.Connection
-    pack: Callable[..., bytes] = connection.__new__(connection)._pack
-    return pack
+    packed: bytes = connection.__new__(connection)._pack(form, *values)
+    return packed
 
 
 EXAMPLES: tuple[Any, ...] = ("x", 1.0, 1, [("1", 1.0, 1, 1)], (1, 2, 3, 4), [1.0], ["a"])
@@ -89,17 +95,12 @@ def _sent(domain: Any, call: Any) -> tuple[int, int] | None:
     return recorder.sent
 
 
-def name_of(command: int, variable: int | None = None) -> str:
-    """Return the name of a command.
+def name_of(command: int, variable: int) -> str:
+    """Return the functions that send a command; its numbers where none does.
 
     Args:
         command: its number.
-        variable: number of its variable; None for a command without one.
+        variable: number of its variable.
     """
-    if variable is None:
-        for name, value in vars(load_traci().constants).items():
-            if name.startswith("CMD_") and value == command:
-                return str(name)
-        return f"the command 0x{command:02x}"
-    unnamed = f"{name_of(command)} of variable 0x{variable:02x}"
+    unnamed = f"the command 0x{command:02x} of variable 0x{variable:02x}"
     return " or ".join(functions().get((command, variable), (unnamed,)))

@@ -86,4 +86,4 @@ def test_a_lane_change_anywhere_on_an_acceleration_lane_is_a_merge_request(name,
             assert vehicle.getLaneID("vut") == point.lane
             assert vehicle.getLanePosition("vut") == pytest.approx(point.position_m, abs=1e-9)
         session.step()
-        session.clear()
+        session.sumo.clear()

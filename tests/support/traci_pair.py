@@ -28,7 +28,6 @@ from merge_sumo.sumo.mirror import (
     DEPARTURE_SPEED_MODE,
     NET,
     OPTIONS,
-    RGBA,
     TYPES,
     MirrorSimulation,
     edges_of,
@@ -189,7 +188,6 @@ class Pair:
             place = {"departPos": str(point.position_m), "departSpeed": str(v_mps)}
             place["departLane"] = point.lane.rpartition("_")[2]
             vehicle.add(name, f"route.{name}", typeID=name, **place)
-            vehicle.setColor(name, RGBA[name == "vut"])
             before_mps[name] = v_mps
         for step in range(steps):
             self.session.answered()
@@ -240,7 +238,6 @@ class Drive:
         self.real.simulationStep()
         vehicle.setSpeedMode("vut", DEPARTURE_SPEED_MODE)
         vehicle.setLaneChangeMode("vut", 0)
-        vehicle.setColor("vut", RGBA[1])
         vehicle.setSpeed("vut", 18.0)
 
     def restart(self, pov: tuple[float, float] = (-250.0, 30.0)) -> None:

@@ -12,7 +12,7 @@ from functools import partial
 from operator import attrgetter, itemgetter
 from typing import Any, NamedTuple
 
-from merge_sumo.sumo.traci_names import packer
+from merge_sumo.sumo.traci_names import pack
 
 MAX_MESSAGE_BYTES = 1 << 20
 """Limit of a message; random bytes that are read as a length mostly exceed it."""
@@ -104,12 +104,6 @@ class Reader:
             return self.raw(self.value("i")).decode("utf-8")
         except UnicodeDecodeError as error:
             raise ProtocolError("a string is not UTF-8") from error
-
-    def count(self) -> int:
-        """Return the number of values of the compound that is next."""
-        if self.value("B") != COMPOUND:
-            raise ProtocolError("a compound was expected")
-        return self._length()
 
     def typed(self, nesting: int = 0) -> Any:
         """Return the next value, with a type before it; a compound is a list of its values.
@@ -251,18 +245,6 @@ def compound(count: int, content: bytes) -> bytes:
         content: the values with their types.
     """
     return struct.pack("!Bi", COMPOUND, count) + content
-
-
-def pack(form: str, *values: Any) -> bytes:
-    """Return values with their types, as SUMO's own client packs them.
-
-    Args:
-        form: a letter for each value: integer (i), double (d), string (s), signed (b) and unsigned
-            byte (B), list of strings (l) or of floats (f), position in the plane (o), in space (O),
-            on earth (g, G) or on a road (r), colour (c), polygon (p).
-        *values: the values.
-    """
-    return packer()(form, *values)
 
 
 def packed(function: str, answer: Any) -> bytes:

@@ -52,7 +52,6 @@ class Reply(msgspec.Struct, omit_defaults=True):
         merge: whether the VUT requests to leave the acceleration lane.
         by_sumo: whether SUMO's own driver chose the speed.
         fault: the client's fault; "" without one.
-        gone: whether the connection of the client has ended, so that its program may say why.
         closed: whether the client has closed it while the VUT was not on the road.
         refused: why the process cannot carry out the request; "" if it did.
         in_vain: commands of the episode that changed nothing.
@@ -62,30 +61,17 @@ class Reply(msgspec.Struct, omit_defaults=True):
     merge: bool = False
     by_sumo: bool = False
     fault: str = ""
-    gone: bool = False
     closed: bool = False
     refused: str = ""
     in_vain: list[str] = []
 
 
 class FaultError(Exception):
-    """A fault of the client.
+    """A fault of the client, in words."""
 
-    Attributes:
-        gone: as in `Reply`.
-        closed: as in `Reply`.
-    """
 
-    def __init__(self, text: str, *, gone: bool = False, closed: bool = False) -> None:
-        """Keep the fault.
-
-        Args:
-            text: the fault in words.
-            gone: as in `Reply`.
-            closed: as in `Reply`.
-        """
-        super().__init__(text)
-        self.gone, self.closed = gone, closed
+class GoodbyeError(FaultError):
+    """The client has closed the connection while the VUT was not on the road."""
 
 
 class ServerProcess(ChildProcess):
@@ -180,7 +166,7 @@ class Server:
         try:
             reply: Reply = getattr(self, action)(**values)
         except FaultError as fault:
-            reply = Reply(fault=str(fault), gone=fault.gone, closed=fault.closed)
+            reply = Reply(fault=str(fault), closed=isinstance(fault, GoodbyeError))
         except UserError as error:
             return Reply(refused=str(error))
         reply.in_vain = sorted(self._session.in_vain)
@@ -221,7 +207,7 @@ class Server:
         else:
             if session.sumo.at_m:
                 # The step in which they arrive was made when the client asked for it.
-                session.clear()
+                session.sumo.clear()
                 self._answer_step()
             self._serve_until_step()
             session.enter(states, seed)
@@ -236,7 +222,7 @@ class Server:
         session.expected = False
         for _ in range(FAREWELL_STEPS):
             if session.sumo.at_m:
-                session.clear()
+                session.sumo.clear()
             else:
                 session.step()
             if self._target_s is not None:
@@ -285,8 +271,9 @@ class Server:
             self._commands.clear()
             self._answers += status(CLOSE)
             self._flush()
-            reason = "the controller closed the connection during the episode"
-            raise FaultError(reason, gone=True, closed=VUT_ID not in sumo.at_m)
+            if VUT_ID not in sumo.at_m:
+                raise GoodbyeError("the controller closed the connection")
+            raise FaultError("the controller closed the connection during the episode")
         if command.identifier != STEP:
             self._answers += session.handle(command)
             return
@@ -305,11 +292,8 @@ class Server:
         self._client.settimeout(self._deadline_s)
         try:
             self._client.sendall(content)
-        except TimeoutError as error:
-            late = f"the controller took no answer within {self._deadline_s:g} s"
-            raise FaultError(late) from error
         except OSError as error:
-            raise FaultError("the controller closed the connection", gone=True) from error
+            raise FaultError(f"the controller took no answer: {error}") from error
 
     def _receive(self, until: float) -> list[Command]:
         """Return the commands of a message that comes before a time."""
@@ -336,6 +320,6 @@ class Server:
             except OSError:
                 pass  # it has broken the connection
             if not part:
-                raise FaultError("the controller closed the connection", gone=True)
+                raise FaultError("the controller closed the connection")
             content += part
         return content

@@ -23,18 +23,18 @@ from merge_sumo.controllers.traci.protocol import (
     SET_VEHICLE,
     VERSION,
     Command,
+    Position,
     ProtocolError,
     Reader,
     command,
-    pack,
     packed,
     status,
     string,
 )
-from merge_sumo.scenario.scenario import DT_S, VEHICLES
+from merge_sumo.scenario.scenario import DT_S
 from merge_sumo.sumo.binding import SUMO_VERSION
 from merge_sumo.sumo.mirror import VUT_ID, MirrorSimulation, RefusedError, State
-from merge_sumo.sumo.traci_names import functions, name_of
+from merge_sumo.sumo.traci_names import functions, name_of, pack
 
 QUESTIONS = frozenset({*range(0x24, 0x2C), *range(0xA0, 0xB0)})
 """Identifiers of questions, one for each domain."""
@@ -241,19 +241,12 @@ class Session:
             # As from its departure on, it keeps its speed where nothing is commanded.
             self.sumo.call("vehicle.setSpeed", VUT_ID, states[VUT_ID][1])
 
-    def clear(self) -> None:
-        """End the episode: all vehicles arrive, and subscriptions to them end."""
-        self.sumo.clear()
-        for subject in list(self.subscriptions):
-            if subject.getter == GET_VEHICLE and subject.name in VEHICLES:
-                del self.subscriptions[subject]
-
     def results(self) -> bytes:
         """Return the answer to a step without its status: the subscribed values."""
         self._last_place, self._next_place, self._next_mps = self._next_place, None, None
         answers = []
         for subject, variables in self.subscriptions.items():
-            with suppress(RefusedError):  # SUMO has it no more
+            with suppress(RefusedError):  # it is not there
                 answers.append(self._result(subject, variables))
         return struct.pack("!i", len(answers)) + b"".join(answers)
 
@@ -290,7 +283,7 @@ class Session:
         is_context = identifier - CONTEXT in QUESTIONS
         domain = getter = identifier - (CONTEXT if is_context else SUBSCRIBE)
         if getter not in QUESTIONS:
-            raise RefusedError(f"merge-sumo does not carry out {name_of(identifier)}")
+            raise RefusedError(f"merge-sumo does not carry out the command 0x{identifier:02x}")
         reader.raw(16)  # its begin and its end: it holds until it is ended
         name, range_m = reader.value("s"), None
         if is_context:
@@ -311,12 +304,11 @@ class Session:
                 return packed(function, own)
             if function == "simulation.convert2D":
                 return self._conversion(reader)
+            arguments = reader.arguments()
             if function == "vehicle.getDrivingDistance":
-                function, arguments = self._driving_distance(name, reader)
-            else:
-                arguments = reader.arguments()
-                if name and not function.endswith(("getIDList", "getIDCount")):
-                    arguments = [name, *arguments]
+                arguments = self._on_road(arguments[0])
+            if name and not function.endswith(("getIDList", "getIDCount")):
+                arguments = [name, *arguments]
             return packed(function, self.sumo.call(function, *arguments))
         except (ProtocolError, TypeError, ValueError, IndexError, AttributeError) as error:
             raise RefusedError(f"merge-sumo does not answer {function}: {error}") from error
@@ -356,16 +348,13 @@ class Session:
             raise ProtocolError(f"coordinates of type {target} do not exist")
         return pack(letter, self.sumo.call(f"simulation.{function}", *arguments))
 
-    def _driving_distance(self, name: str, reader: Reader) -> tuple[str, list[Any]]:
-        """Return the function for the distance of a vehicle to a position, and its arguments."""
-        reader.count()
-        kind, place = reader.typed()
+    def _on_road(self, position: Position) -> list[Any]:
+        """Return the edge of a position, the position along it in m, and the lane."""
+        kind, place = position
         if kind == ROAD:
-            return "vehicle.getDrivingDistance", [name, *place]
-        x, y, *_ = place
-        # At a point without a road SUMO would end.
-        self.sumo.call("simulation.convertRoad", x, y, kind == LON_LAT, "passenger")
-        return "vehicle.getDrivingDistance2D", [name, x, y]
+            return place
+        is_geo = kind == LON_LAT
+        return list(self.sumo.call("simulation.convertRoad", *place[:2], is_geo, "passenger"))
 
     def position(self, name: str) -> tuple[float, ...]:
         """Return the position of a vehicle in the plane, (x, y) in m.
@@ -426,15 +415,15 @@ class Session:
         return content
 
     def _around(self, subject: Subject, range_m: float) -> list[str]:
-        """Return the objects of a domain that are at most `range_m` away from an object."""
+        """Return the vehicles that are at most `range_m` away from an object."""
+        if subject.domain != GET_VEHICLE:
+            raise RefusedError("there are context subscriptions to vehicles alone")
         if subject.getter == GET_VEHICLE:
             point = self.position(subject.name)
         elif subject.getter == GET_JUNCTION:
             point = self.sumo.call("junction.getPosition", subject.name)
         else:
             raise RefusedError("there are context subscriptions of vehicles and junctions")
-        if subject.domain != GET_VEHICLE:
-            return self.sumo.around(point, subject.domain, range_m)
         # SUMO may still have them where they were before they were put back.
         found = []
         for other in sorted(self.sumo.at_m):

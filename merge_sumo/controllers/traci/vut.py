@@ -137,7 +137,6 @@ class TraciDriver(ControllerDriver):
         """
         super().__init__(1)
         self._kind, self._options = kind, kind.options
-        self._log = kind.options.log
         self._road, self._scenario = road, scenario
         self._server = ServerProcess(road, scenario)
         self._begins_m = np.full(scenario.vehicles, -road.mainline.before_m)
@@ -254,8 +253,6 @@ class TraciDriver(ControllerDriver):
             reply = self._server.request(action, patience_s, **values)
         except ProcessDiedError as died:
             reason = f"the SUMO that answers the controller {died}"
-            if died.hung:
-                raise FaultError(reason) from died
             # Killed from outside, or by a question of the client: the case runs again, which shows.
             self._disconnect()
             raise EpisodesLostError(reason) from died
@@ -263,7 +260,7 @@ class TraciDriver(ControllerDriver):
         if not reply.fault or reply.closed:
             return reply
         text = reply.fault
-        if reply.gone and self._program is not None and (ended := self._program.ended(0.5)):
+        if self._program is not None and (ended := self._program.ended(0.5)):
             text += f"; {ended}"
         raise FaultError(text)
 
@@ -290,8 +287,7 @@ class TraciDriver(ControllerDriver):
         if self._client is None:
             port: int = self._listener.getsockname()[1]
             if self._kind.command is not None:
-                self._program = Program(self._kind.command, port, self._log)
-                self._log = self._log or Path(os.devnull)  # the same text again is not shown
+                self._program = Program(self._kind.command, port, self._options.log)
             else:
                 sys.stderr.write(
                     f"waiting up to {patience_s:g} s for a TraCI client on {HOST}:{port}\n"
