@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from contextlib import chdir, suppress
-from functools import cached_property
 from importlib import import_module
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -11,7 +10,6 @@ from typing import Any
 from merge_sumo.controllers.controller import Controller, Seen, Start, as_merge
 from merge_sumo.controllers.spec import FileKind
 from merge_sumo.errors import UserError
-from merge_sumo.printable import either
 from merge_sumo.scenario.scenario import DT_S
 
 INPUTS = ("x_pov_m", "v_pov_mps", "x_vut_m", "v_vut_mps")
@@ -22,7 +20,7 @@ MERGE = "merge"
 SEED = "seed"
 """Optional variables: an output, whether to merge, and an input or a parameter."""
 FLOATS = ("Real", "Float64", "Float32")
-INTEGERS = ("Integer", "Int32", "UInt32", "Int64", "UInt64")
+"""Types of variables that a float is written to."""
 
 
 class FmuKind(FileKind):
@@ -55,8 +53,11 @@ class FmuKind(FileKind):
         """
         super().load()
         path = self.path
+        # The unpacked unit; it is removed with this object.
+        self._folder = TemporaryDirectory(prefix="merge-sumo-fmu-", ignore_cleanup_errors=True)
         try:
             self._description = self.api.read_model_description(str(path))
+            self.api.extract(str(path), self._folder.name)
         except Exception as error:  # of many classes: XML, zip, FMPy's own
             raise UserError(f"{path} is not a readable FMU: {str(error)[:200]}") from error
         simulation, version = self._description.coSimulation, str(self._description.fmiVersion)
@@ -82,8 +83,8 @@ class FmuKind(FileKind):
         if self.output is None:
             self.chosen.setdefault(OUTPUT, OUTPUT)  # it must be there
             self.output = self._variable(OUTPUT, "output")
-        self.merge_request = self._variable(MERGE, "output", (*FLOATS, "Boolean"))
-        self.seed = self._variable(SEED, "input parameter", (*FLOATS, *INTEGERS))
+        self.merge_request = self._variable(MERGE, "output")
+        self.seed = self._variable(SEED, "input parameter")
 
     def controller(self) -> Controller:
         """Return a controller of one corridor."""
@@ -104,24 +105,15 @@ class FmuKind(FileKind):
         instance.instantiate()
         return instance
 
-    @cached_property
-    def _folder(self) -> TemporaryDirectory[str]:
-        """The unpacked unit; it is removed with this object."""
-        folder = TemporaryDirectory(prefix="merge-sumo-fmu-", ignore_cleanup_errors=True)
-        self.api.extract(str(self.path), folder.name)
-        return folder
-
-    def _variable(self, key: str, causalities: str, types: tuple[str, ...] = FLOATS) -> Any:
+    def _variable(self, key: str, causalities: str) -> Any:
         """Return the variable of one of our names, or None.
 
         Args:
             key: our name of the variable.
             causalities: causalities that it must have where the spec does not name it.
-            types: types that it may have.
 
         Raises:
-            UserError: for a variable that the spec names and that is not there, or is of another
-                type.
+            UserError: for a variable that the spec names and that is not there.
         """
         name = self.chosen.get(key, key)
         variable = self._variables.get(name)
@@ -131,11 +123,6 @@ class FmuKind(FileKind):
         elif variable is None:
             names = ", ".join(sorted(self._variables)[:12])
             raise UserError(f"{self.path} has no variable {name!r}; it has {names}")
-        if variable.type not in types:
-            raise UserError(
-                f"the variable {name!r} of {self.path} is a {variable.type}: it must be a "
-                f"{either(types)}"
-            )
         return variable
 
 

@@ -104,18 +104,12 @@ class OnnxKind(FileKind):
                 f"{', '.join(STATE)}, and optionally {SEED}, a float, a double or an int64 "
                 f"({type(error).__name__}: {error})"
             ) from error
-        if output.dtype.kind != "f":
+        if output.dtype.kind != "f" or output.size not in (1, 2, ACTIONS, ACTIONS + 1):
             raise UserError(
-                f"{self.path} gives {output.dtype}, and a VUT gives floats: the index of an action "
-                f"is not an acceleration, so let the network give the {ACTIONS} values of actions "
-                "without ArgMax, or run it in a VUT in Python (FILE.py:CLASS) that answers the "
-                "acceleration of its action in m/s2"
-            )
-        if output.size not in (1, 2, ACTIONS, ACTIONS + 1):
-            raise UserError(
-                f"{self.path} gives {output.size} numbers: a VUT gives one acceleration, or "
-                f"{ACTIONS} values of actions, from the hardest braking to the hardest "
-                "acceleration, and optionally one number more, which is whether to merge"
+                f"{self.path} gives {output.size} numbers of type {output.dtype}: a VUT gives "
+                f"floats, one acceleration or {ACTIONS} values of actions (without ArgMax), from "
+                "the hardest braking to the hardest acceleration, and optionally one more, which "
+                "is whether to merge"
             )
 
 

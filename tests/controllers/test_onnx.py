@@ -75,7 +75,7 @@ def test_a_network_with_an_input_seed_is_told_that_of_each_case(tmp_path, kind, 
         ({"width": 5}, "", "does not run with the inputs of a VUT"),
         ({"answer": [0.0, 1.0, 0.0]}, "", "gives 3 numbers"),
         ({"seed": (onnx.TensorProto.INT32, [1])}, "", "an int64 (KeyError: 'tensor(int32)')"),
-        ({"answer": [0, 3, 1], "last": "ArgMax"}, "", "gives int64, and a VUT gives floats"),
+        ({"answer": [0, 3, 1], "last": "ArgMax"}, "", "gives 3 numbers of type int64"),
     ],
 )
 def test_a_network_that_cannot_drive_is_refused_in_a_sentence(tmp_path, options, parameter, said):
