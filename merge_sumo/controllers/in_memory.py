@@ -12,10 +12,10 @@ from typing import Any, Protocol, SupportsFloat
 
 from merge_sumo.controllers.controller import Seen
 from merge_sumo.controllers.kinds import parse, runs_code
-from merge_sumo.controllers.python import InProcessKind, SeenBatch, object_of, objects
+from merge_sumo.controllers.python import SeenBatch, object_of, objects
 from merge_sumo.controllers.signatures import is_code
-from merge_sumo.controllers.spec import HERE, ControllerOptions, ControllerSpec
-from merge_sumo.errors import UserError, notice
+from merge_sumo.controllers.spec import HERE, ControllerSpec
+from merge_sumo.errors import notice
 
 Answer = SupportsFloat | tuple[SupportsFloat, bool]
 """An acceleration, or it and whether to merge."""
@@ -51,10 +51,7 @@ def spec_of(vut: Any) -> str:
     """Return the spec of a VUT for this process and for those that it starts.
 
     Args:
-        vut: a spec, or an object that drives.
-
-    Raises:
-        UserError: for another object.
+        vut: a spec, or an object that drives; that it can is checked when it is loaded.
     """
     if isinstance(vut, str):
         return vut
@@ -66,14 +63,8 @@ def spec_of(vut: Any) -> str:
     while objects.get(unique, vut) is not vut:
         number += 1
         unique = f"{name}-{number}"
-    spec = ControllerSpec(HERE, unique)
     objects[unique] = vut
-    try:
-        InProcessKind(spec, ControllerOptions())
-    except UserError:
-        del objects[unique]
-        raise
-    return str(spec)
+    return str(ControllerSpec(HERE, unique))
 
 
 def is_in_process(text: str) -> bool:

@@ -39,13 +39,13 @@ KINDS: Registry[type[ControllerKind]] = Registry(
 
 
 def parse(text: str) -> ControllerSpec:
-    """Return the parts of `[KIND:]ARGUMENT[?NAME=VALUE&...]`.
+    """Return the parts of `[KIND:]ARGUMENT[?NAME=VALUE&...]`; of equal names the last counts.
 
     Args:
         text: a text as after `--vut`; an unknown name counts as that of an installed VUT.
 
     Raises:
-        UserError: for a malformed parameter, and for one that is given twice.
+        UserError: for a malformed parameter.
     """
     kind, _, argument = text.partition(":")
     if kind not in KINDS or kind in WITHOUT_PREFIX:
@@ -58,8 +58,6 @@ def parse(text: str) -> ControllerSpec:
         name, _, value = part.partition("=")
         if not (name and value):
             raise UserError(f"{text}: {part!r} is not an option: write NAME=VALUE")
-        if name in parameters:
-            raise UserError(f"{text}: the option {name} is there twice")
         parameters[name] = value
     if not kind:
         named = PYTHON if ":" in argument else INSTALLED

@@ -10,7 +10,7 @@ import sys
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import partial
 from importlib.metadata import EntryPoint
 from pathlib import Path
 from types import ModuleType
@@ -500,24 +500,23 @@ def _module_of(source: str) -> ModuleType:
 
 def _imported(name: str) -> ModuleType:
     """Return a module; as in a Python started there, it may be in the working folder."""
-    folder = str(Path.cwd())
-    is_new = folder not in sys.path
-    if is_new:
-        sys.path.append(folder)
-    try:
-        found = importlib.util.find_spec(name.partition(".")[0])
-        if found is not None and found.has_location and found.origin is not None:
-            check_code(Path(found.origin))
-        return importlib.import_module(name)
-    finally:
-        if is_new:
-            sys.path.remove(folder)
+    _search_in(Path.cwd())
+    found = importlib.util.find_spec(name.partition(".")[0])
+    if found is not None and found.has_location and found.origin is not None:
+        check_code(Path(found.origin))
+    return importlib.import_module(name)
+
+
+def _search_in(folder: Path) -> None:
+    """Let modules of a folder be imported, after those of all other folders."""
+    if str(folder) not in sys.path:
+        sys.path.append(str(folder))
 
 
 def module_of_file(path: Path) -> ModuleType:
-    """Return the module of a file; it is executed once, and again when it has changed.
+    """Execute a file as a module, which can import the modules next to it, and return it.
 
-    It can import the modules next to it. What its code raises is not caught.
+    What its code raises is not caught.
 
     Args:
         path: the file.
@@ -525,17 +524,12 @@ def module_of_file(path: Path) -> ModuleType:
     Raises:
         OSError: if it cannot be read.
     """
-    return _executed(path.resolve(), path.stat().st_mtime_ns)
-
-
-@cache
-def _executed(path: Path, _changed_ns: int) -> ModuleType:
+    path = path.resolve()
     spec = importlib.util.spec_from_file_location(f"merge_sumo_file_{path.stem}", path)
     if spec is None or spec.loader is None:
         raise ImportError("it is not a Python file")
     module = importlib.util.module_from_spec(spec)
-    if str(path.parent) not in sys.path:
-        sys.path.append(str(path.parent))  # for the modules next to it
+    _search_in(path.parent)
     sys.modules[spec.name] = module
     spec.loader.exec_module(module)
     return module

@@ -176,7 +176,7 @@ class TestParameters:
 @pytest.mark.parametrize(
     ("case", "params", "words"),
     [
-        (None, ["gap=1..2"], "has no such parameter: choose from gap_m"),
+        (None, ["gap=1..2"], "has no parameter 'gap': choose from"),
         (None, ["gap_m=1..2"], "it is 16.2 today, which is not in that range"),
         (None, ["gap_m=8"], "write NAME=LOW..HIGH"),
         ("passed", [], "did not fail: name a failure"),

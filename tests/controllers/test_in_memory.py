@@ -10,6 +10,7 @@ import pytest
 
 import merge_sumo as ms
 from merge_sumo.controllers.in_memory import is_in_process, spec_of
+from merge_sumo.controllers.kinds import load
 
 SMALL: dict[str, Any] = {"level": 0, "cases": 4, "seed": 1}
 
@@ -49,7 +50,7 @@ class TestASpec:
     @pytest.mark.parametrize("thing", [None, object(), type("Nothing", (), {}), lambda: 0.0])
     def test_of_another_object_is_refused(self, thing):
         with pytest.raises(ms.UserError, match=r"a VUT is a class|is called as"):
-            spec_of(thing)
+            load(spec_of(thing))
 
     def test_that_was_an_object_of_another_process_says_so(self):
         with pytest.raises(ms.UserError, match="was an object of a Python process"):

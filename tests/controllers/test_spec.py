@@ -38,11 +38,6 @@ def test_what_is_no_parameter_is_refused(text):
         parse(text)
 
 
-def test_a_parameter_is_given_once():
-    with pytest.raises(UserError, match="the option kp is there twice"):
-        parse("design2?kp=1&kp=2")
-
-
 def test_a_value_is_set_in_the_place_of_an_older_one():
     named = parse("a.py:V?x=1&y=2").with_value("y", 3.0).with_value("z", 0.5)
     assert str(named) == "a.py:V?x=1&y=3&z=0.5"
