@@ -21,7 +21,7 @@ from merge_sumo.controllers.traci import protocol
 from merge_sumo.controllers.traci.session import NotFiniteError
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.scenario.imperfection import Actuation
-from merge_sumo.sumo import traci_names
+from merge_sumo.sumo.traci_names import pack
 
 LIMITS: dict[int, list[tuple]] = {
     0: [("vehicletype", "setAccel", 0.7), ("vehicle", "setDecel", 1.3), ("vehicle", "setTau", 3.0)],
@@ -130,11 +130,9 @@ def test_only_keys_of_the_controllers_own_reach_sumo(drive):
 class TestBytes:
     VUT = protocol.string("vut")
     COMMANDS = (
-        protocol.command(b"\xc4\x40" + VUT + traci_names.pack("d", 3.0)),
-        protocol.command(b"\xa4\x68" + VUT + traci_names.pack("d", 9.0)),
-        protocol.command(
-            b"\xa4\x83" + VUT + protocol.compound(2, traci_names.pack("r", ("a", 1, 0)))
-        ),
+        protocol.command(b"\xc4\x40" + VUT + pack("d", 3.0)),
+        protocol.command(b"\xa4\x68" + VUT + pack("d", 9.0)),
+        protocol.command(b"\xa4\x83" + VUT + protocol.compound(2, pack("r", ("a", 1, 0)))),
         protocol.command(b"\xab\x82" + protocol.string("") + protocol.compound(2, b"\1" * 17)),
         protocol.command(b"\xd4" + struct.pack("!dd", 0, 9) + VUT + b"\1@"),
         protocol.command(b"\x84" + struct.pack("!dd", 0, 9) + VUT + b"\xa3" + b"\0" * 9),
