@@ -1,6 +1,7 @@
-"""Signals: the first Ctrl-C finishes the running batch, a second one or SIGTERM stops at once.
+"""SIGINT and SIGTERM: the first finishes the running batch, the second stops at once.
 
-Work without a batch stops at the first signal, in good order.
+After SIGTERM, systems send SIGKILL: the running batch has a few seconds to finish. Work without a
+batch stops at the first signal, in good order.
 """
 
 from __future__ import annotations
@@ -13,9 +14,12 @@ from contextlib import contextmanager
 from types import FrameType
 from typing import Any, Self
 
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
 ENDING = ("SIGTERM", "SIGHUP")
 """SIGHUP comes when a terminal is closed; not every platform has it."""
 STDERR = 2
+PATIENCE_S = 5.0
+"""Time in s after SIGTERM in which the running batch may end."""
 
 
 class Stopped(BaseException):
@@ -37,39 +41,45 @@ class Stopped(BaseException):
 
 
 class Interrupt:
-    """Within `with`, Ctrl-C is noted; to be used in the main thread.
+    """Within `with`, signals are noted; to be used in the main thread.
 
-    `check` raises `Stopped` after the first one; the second raises it wherever the program is.
+    `check` raises `Stopped` after the first signal; the second raises it wherever the program is.
     """
 
     def __init__(self, note: str) -> None:
-        """Prepare to note Ctrl-C.
+        """Prepare to note signals.
 
         Args:
-            note: what is printed at the first one.
+            note: what is printed at the first signal.
         """
         self._note = f"\n{note}\n".encode()
-        self._noted = False
-        self._before: Any = None
+        self._number: int | None = None
+        self._before: list[Any] = []
+        self._again = threading.Timer(PATIENCE_S, os.kill, (os.getpid(), signal.SIGTERM))
+        self._again.daemon = True
 
     def check(self) -> None:
-        """Raise `Stopped` when Ctrl-C has come."""
-        if self._noted:
-            raise Stopped(signal.SIGINT)
+        """Raise `Stopped` when a signal has come."""
+        if self._number is not None:
+            raise Stopped(self._number)
 
     def _handle(self, number: int, _: FrameType | None) -> None:
-        if self._noted:
+        if self._number is not None:
             raise Stopped(number)
-        self._noted = True
+        self._number = number
         # Not print: the signal may have come in the middle of one.
         os.write(STDERR, self._note)
+        if number == signal.SIGTERM:
+            self._again.start()
 
     def __enter__(self) -> Self:
-        self._before = signal.signal(signal.SIGINT, self._handle)
+        self._before = [signal.signal(number, self._handle) for number in SIGNALS]
         return self
 
     def __exit__(self, *_: object) -> None:
-        signal.signal(signal.SIGINT, self._before)
+        self._again.cancel()
+        for number, handler in zip(SIGNALS, self._before, strict=True):
+            signal.signal(number, handler)
 
 
 @contextmanager

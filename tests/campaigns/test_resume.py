@@ -178,10 +178,10 @@ class TestASignal:
         monkeypatch.setattr(os, "write", lambda file, text: said.append((file, text)))
         with Interrupt("wait") as stop:
             stop.check()
-            signal.raise_signal(signal.SIGINT)
+            signal.raise_signal(signal.SIGTERM)
             with pytest.raises(Stopped) as stopped:
                 stop.check()
-            assert stopped.value.exit_code == 130
+            assert stopped.value.exit_code == 143
             with pytest.raises(Stopped) as stopped:
                 signal.raise_signal(signal.SIGINT)
             assert stopped.value.exit_code == 130
