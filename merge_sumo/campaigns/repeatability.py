@@ -5,9 +5,9 @@
 
 # An episode must depend on its case alone. A controller that draws random numbers without the seed
 # of its case, reads a clock, or keeps a state from one episode to the next violates this: its
-# results depend on the number of workers, on the sampler, and on chance. `cases_to_repeat` chooses
-# the cases. The VUTs of this package need no such check. The option --repeat is another thing: it
-# runs each case several times with other random numbers.
+# results depend on the number of workers, on the sampler, and on chance. `cases_for_second_runs`
+# chooses the cases. The VUTs of this package need no such check. The option --repeat is another
+# thing: it runs each case several times with other random numbers.
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def check_repeatability(
         plan: how its cases run.
         workers: where they run.
     """
-    outcomes = cases_to_repeat(run.outcomes, settings)
+    outcomes = cases_for_second_runs(run.outcomes, settings)
     if not outcomes:
         return
     second_runs = []
@@ -88,7 +88,7 @@ def check_repeatability(
     replace_own(run.folder / REPEATS, b"".join(map(to_json, second_runs)), b'"index"')
 
 
-def cases_to_repeat(outcomes: Sequence[Outcome], settings: CampaignSettings) -> list[Outcome]:
+def cases_for_second_runs(outcomes: Sequence[Outcome], settings: CampaignSettings) -> list[Outcome]:
     """Return the outcomes of the cases that are to run again, in that order.
 
     Half are spread over the campaign, and run first. The other half are the first cases of the

@@ -27,7 +27,8 @@ class PovAfterMerge(DriverWrapper):
         """Take the driver until the merge.
 
         Args:
-            driver: drives all C cars of the mainline in K corridors, as those of C K corridors.
+            driver: drives the C cars of the mainline of K corridors; car c of corridor k has the
+                index c K + k.
         """
         super().__init__(driver)
         self._v_first_mps = np.zeros(driver.corridors)

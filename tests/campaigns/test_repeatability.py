@@ -10,7 +10,7 @@ import merge_sumo as ms
 from merge_sumo.campaigns.recorded import RecordedCampaign
 from merge_sumo.campaigns.repeatability import (
     REPEATS,
-    cases_to_repeat,
+    cases_for_second_runs,
     read_second_runs,
     unrepeatable,
 )
@@ -56,8 +56,8 @@ def test_a_controller_that_remembers_is_named_everywhere(write_vut, tmp_path):
 def test_drivers_of_the_package_and_clients_that_a_user_starts_run_once(run):
     assert read_second_runs(run) == []
     assert not (run.folder / REPEATS).exists()
-    assert cases_to_repeat(run.outcomes, campaign_settings(vut="design1")) == []
+    assert cases_for_second_runs(run.outcomes, campaign_settings(vut="design1")) == []
     settings = campaign_settings(vut="traci")
-    assert cases_to_repeat(run.outcomes, settings) == []
+    assert cases_for_second_runs(run.outcomes, settings) == []
     started = campaign_settings(vut="traci:python3 client.py {port}")
-    assert len(cases_to_repeat(run.outcomes, started)) == 8
+    assert len(cases_for_second_runs(run.outcomes, started)) == 8
