@@ -192,7 +192,13 @@ def _read(folder: Path) -> _Episode:
             f"{folder} is not a replay folder: it has no {CASE}; name a replay folder, or a "
             "campaign and a case"
         )
-    outcome, net = _outcome(folder / CASE), folder / NET
+    net = folder / NET
+    if not net.exists():
+        raise UserError(
+            f"{folder} has no {NET}, as replay folders of earlier versions: move it away, and "
+            "export the case again"
+        )
+    outcome = _outcome(folder / CASE)
     road = road_of_hosted(read_xml(net, "the net"), net, outcome.case.scenario.lane_m)
     name, cars = f"the record {folder / RECORD}", outcome.case.scenario.vehicles
     record, lanes = _record(folder / RECORD, name)

@@ -19,7 +19,11 @@ from __future__ import annotations
 
 import bisect
 import math
-from collections.abc import Callable, Mapping, Sequence
+import os
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
@@ -138,13 +142,16 @@ class SumoSimulation:
             net_file, types_file = folder / "corridors.net.xml", folder / "types.add.xml"
             net_file.write_bytes(hosted_net(self.road, self.corridors))
             types_file.write_bytes(_types(self.vut_type, self.car_type, self.scenario))
+            messages = folder / "messages"
             files = ("--net-file", str(net_file), "--additional-files", str(types_file))
             try:
-                libsumo.start(["sumo", *files, *SUMO_OPTIONS, *NO_COLLISIONS])
+                with _standard_error_into(messages):
+                    libsumo.start(["sumo", *files, *SUMO_OPTIONS, *NO_COLLISIONS])
             except libsumo.TraCIException as error:
+                message = messages.read_text(encoding="utf-8", errors="replace").split("\n")[0]
+                reason = message.removeprefix("Error: ") or error
                 raise UserError(
-                    f"SUMO cannot load the net {self.road.path} and its vehicle types: it has "
-                    "printed the reason to standard error"
+                    f"SUMO cannot load the net {self.road.path} and its vehicle types: {reason}"
                 ) from error
         # Bound once: attribute look-ups cost as much as the calls themselves.
         self._add, self._remove, self._move_to = vehicle.add, vehicle.remove, vehicle.moveTo
@@ -369,6 +376,20 @@ def _types(
             }
             etree.SubElement(root, "vType", {**careful, **own_type})
     return etree.tostring(root, xml_declaration=True, encoding="UTF-8")
+
+
+@contextmanager
+def _standard_error_into(path: Path) -> Iterator[None]:
+    """Send what a C++ library writes to standard error into a file."""
+    sys.stderr.flush()
+    kept = os.dup(2)
+    try:
+        with path.open("wb") as file:
+            os.dup2(file.fileno(), 2)
+            yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
 
 
 def _raw(libsumo: Any, *names: str) -> list[Any]:
