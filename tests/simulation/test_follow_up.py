@@ -59,7 +59,7 @@ class TestMeasures:
             assert Criterion(met).margin(episode, measures) < 0.0, met
 
     def test_need_a_follow_up(self):
-        with pytest.raises(UserError, match="`follow_up_s` SECONDS"):
+        with pytest.raises(UserError, match="`follow_up_s` above 0"):
             Criterion("after_ttc_s < 2").check(AT_M)
         Criterion("after_ttc_s < 2").check(FOLLOWED)
 
