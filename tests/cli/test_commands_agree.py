@@ -116,7 +116,8 @@ def rerun_changes_nothing(simulation: SumoSimulation) -> None:
 
 
 def truth_judges_as_run(simulation: SumoSimulation) -> None:
-    (truth,) = simulation("truth", *ASKED, "--cases", 10, "--workers", 1)
+    (found,) = simulation("truth", *ASKED, "--cases", 10, "--workers", 1)
+    (truth,) = found["levels"]
     dims = len(simulation.scenario.dimensions(LEVEL))
     points = np.random.default_rng([0, LEVEL]).random((10, dims))
     cases = Pool(levels=(LEVEL,), scenario=simulation.scenario).cases(points, LEVEL)
