@@ -5,7 +5,8 @@ it was recorded. An option has the name of its field, unless `FLAGS` gives anoth
 
 A field of `ScenarioChanges` has the name of a field of `Scenario`, which it replaces
 (`from_config.scenario_from`). One of `Search`, `FailureRule` or `Limits` is a field of
-`CampaignSettings`, and reaches the simulation only where `load_plan` gives it to `SimulationPlan`.
+`CampaignSettings`; `load_plan` gives it to `SimulationPlan`, or to its controllers as one of
+`ControllerOptions`.
 """
 
 from __future__ import annotations
@@ -696,7 +697,7 @@ def values_of(config: object, kind: type[Any]) -> dict[str, Any]:
 
 
 def non_defaults(config: object, kind: type[Any]) -> dict[str, Any]:
-    """Return the same, without the fields whose values are the defaults.
+    """Return the fields of a base class whose values are not the defaults, by name.
 
     A default that the user wrote counts as not given.
 

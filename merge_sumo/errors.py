@@ -42,7 +42,7 @@ def explained(clause: str) -> Iterator[None]:
 
 
 class ControllerError(UserError):
-    """The code of a controller fails before it drives."""
+    """The code of a controller fails before it drives, or its process ends."""
 
 
 class WorkersLostError(UserError):

@@ -1,8 +1,8 @@
 """The loop of a campaign: it asks, submits, collects, stores, tells.
 
 Cases are proposed in batches. Those whose outcomes the sampler was not told yet are pending. Before
-each ask, the loop tells the sampler the outcomes of the oldest batches: as many as it must to make
-room for one more. How many cases may be pending depends on settings and sampler:
+it asks for a batch, the loop tells the sampler the oldest outcomes, until one more batch may be
+pending. How many cases may be pending depends on settings and sampler:
 
     a batch       waits for the one before
     in flight     N cases may be pending, in batches of a third, of a sampler that `overlaps`

@@ -121,7 +121,7 @@ class _Host:
     def serve(self) -> None:
         """Load the controller, then answer request by request."""
         Deadline.before_call = self._beat
-        request = HostRequest("make")
+        request = HostRequest("make")  # never sent: the first reply is to none
         self._answer(request, self._load)
         while request.action != "close":
             request = decode_request(self._connection.recv_bytes())

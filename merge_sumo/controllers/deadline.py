@@ -33,7 +33,8 @@ class Deadline:
 
     While it is entered, a timer in the main thread interrupts a late call, and the output of
     the controller goes to standard error. Native code is not interrupted, and neither is a call in
-    another thread or on Windows: such a call counts as late when it returns.
+    another thread or on Windows: such a call counts as late when it returns. The parent of a child
+    process kills it where it does not return (`hosted.GRACE_S`).
 
     Example:
         ```python
@@ -45,9 +46,9 @@ class Deadline:
 
     Attributes:
         deadline_s: time for a call.
-        before_call: called with the time in s before each call, in a process that hosts a
-            controller; None in others. There a KeyboardInterrupt comes from the controller, and is
-            its fault.
+        before_call: called with the present time in s before each call; None but in the child
+            process of a controller. Where it is set, a KeyboardInterrupt is a fault of the
+            controller, and not an interruption by the user.
     """
 
     before_call: ClassVar[Callable[[float], None] | None] = None

@@ -212,8 +212,8 @@ class HostedDriver(ControllerDriver):
 
     A process that dies, or sends nothing in time, is an `EpisodesLostError`, and so is a request
     that fails as a whole. `Rollout.begin_again` then runs the running episodes again, one at a
-    time, so that a second loss is of one case. A process that has ended is started again with the
-    next request. The error of a call is a reason of the reply: `ControllerArray` says how it
+    time: at a second loss it is clear by which case. A process that has ended is started again with
+    the next request. The error of a call is a reason of the reply: `ControllerArray` says how it
     travels.
     """
 
@@ -258,7 +258,7 @@ class HostedDriver(ControllerDriver):
             if not self._process.alive:
                 self._process = self._new_process()
             reply = self._process.request(request)
-        except UserError as error:
+        except UserError as error:  # such as `ProcessDiedError`
             raise EpisodesLostError(str(error)) from None
         self._files.update(paths_of(reply))
         self._reasons, self._signals = reply.reasons, {}

@@ -134,9 +134,9 @@ class ControllerKind:
         has_parameters: whether "?" ends the argument in a spec.
         no_parameters: why a spec cannot set parameters, in a clause; "" where it can.
         hosted: whether it runs a user's code, so that `kinds.load` gives it a process of its own.
-            Such a kind implements `controller`, or a `driver` that is a `ControllerDriver`. It
-            cannot ask SUMO, and of its attributes only `no_parameters`, `max_workers`,
-            `max_corridors` and `code` reach the plan (`HostedKind`).
+            Such a kind implements `controller`, or a `driver` that is a `ControllerDriver`, and
+            cannot ask SUMO. Other processes know only its `no_parameters`, `max_workers`,
+            `max_corridors` and `code` (`HostedKind`).
         own_code: whether code of the user runs in a test.
         files_are_known: whether `code` names all files of the controller before it drives.
         asks_sumo: whether its drivers ask SUMO, or are SUMO's own; their cases take longer.

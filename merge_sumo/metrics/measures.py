@@ -469,7 +469,7 @@ class Measures:
 
     @measure(worse="high", label="hardest braking after M", only_with=FOLLOW_UP)
     def after_brake_mps2(self) -> float | None:
-        """Hardest braking in the follow-up.
+        """Hardest braking in the follow-up, as driven; `brake_after_mps2` is the braking needed.
 
         It is of cars behind the VUT, and of the VUT where the nearest car is ahead; None without a
         merge.

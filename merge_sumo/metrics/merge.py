@@ -96,7 +96,7 @@ def brake_after_mps2(trajectory: Trajectory) -> float:
         trajectory: the motion.
 
     Returns:
-        0 where no vehicle has to brake or the VUT never merged; infinite where bodies overlap or no
+        0 where no vehicle has to brake; infinite where bodies overlap or no
         braking is in time.
     """
     needed_mps2 = [0.0]

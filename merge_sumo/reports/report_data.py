@@ -43,7 +43,7 @@ def page_data(model: ReportModel) -> dict[str, Any]:
         model: the content of the report.
 
     Returns:
-        `cases` has a list for each name of `_row`, with an item a shown case. `allCases` in
+        `cases` maps each name of `_row` to a list with a value for each shown case. `allCases` in
         report.js makes the table All cases of it, with a column for each entry of `measures`.
         `speeds` is as `packed` returns it.
     """

@@ -30,14 +30,13 @@ OF_THE_POV = "the POV: "
 """Prefix of the reason of an error that a POV made."""
 
 MAX_LOSSES = 2
-"""Number of `EpisodesLostError`, with one case alone, after which the case is at fault: a single
-one may have come from outside."""
+"""Losses of a case that runs alone, after which it is at fault; one may have another cause."""
 
 END_OF_ROAD_M = 20.0
 """Distance from the end of the road at which a follow-up ends."""
 
 NEVER = 2**62
-"""Step at which a corridor without an episode times out."""
+"""Row at which a corridor without an episode times out."""
 
 
 @dataclass(slots=True)
@@ -50,7 +49,7 @@ class _Running:
         first_row: first row of its record.
         merge_row: row in which the VUT is at M; None before, and without a follow-up.
         clipped: number of answers that were clipped before M.
-        left: signals of the VUT, with the row of the episode at which they were left.
+        left: row of the episode and signals, for each step in which the VUT set signals.
     """
 
     index: int
@@ -131,6 +130,7 @@ class Rollout:
         self.record = np.zeros((corridors, self.ring, vehicles, 3))
         self.ended: dict[int, Trajectory] = {}
         self.row = 0
+        """Number of rows begun so far: within a step, the present row is the one before."""
         self.now = self.record[:, 0]
         """The row of this step."""
 
@@ -206,8 +206,8 @@ class Rollout:
         """Let the running episodes begin again, one at a time; end the one at fault, if any.
 
         Until the last of these suspects has ended, `alone` is true, and `next_case` gives suspects
-        instead of new cases. Once an episode is at fault, the earlier losses count as its doing:
-        no case before it counts as one that ran again.
+        instead of new cases. An episode at fault has caused all losses so far, so `ran_again` is
+        emptied.
 
         Args:
             lost: why the episodes are lost.
