@@ -24,7 +24,7 @@ from dataclasses import dataclass, field
 from numbers import Integral
 from typing import Any, Generic, TypeVar
 
-from merge_sumo.errors import UserError, WorkersLostError
+from merge_sumo.errors import UserError, WorkersLostError, notice
 from merge_sumo.files import ScratchFolder
 from merge_sumo.spawning import forget_safe_path, without_cwd, without_main
 
@@ -278,6 +278,12 @@ def open_workers(workers: AnyWorkers = AUTO) -> Workers:
     if isinstance(workers, str) and workers != AUTO:
         return dask_workers(workers)
     count = number_of_workers(workers)
+    if count > 1 and multiprocessing.current_process().daemon:
+        notice(
+            "the cases run in this process, as a daemonic process, such as a worker of "
+            "multiprocessing.Pool, starts no others"
+        )
+        count = 1
     return Workers() if count == 1 else Workers(LocalProcesses, count)
 
 

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import multiprocessing
 import os
 import signal
 import subprocess
 import sys
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,8 +19,9 @@ from support.campaigning import campaign_settings, run_campaign
 from support.plans import plan_for
 from support.processes import wait_for
 
+from merge_sumo import api
 from merge_sumo.campaigns.recorded import OUTCOMES
-from merge_sumo.errors import UserError
+from merge_sumo.errors import Notice, UserError
 from merge_sumo.scenario.case import from_unit
 from merge_sumo.scenario.scenario import US23
 from merge_sumo.scenario.trajectory import End
@@ -202,6 +205,23 @@ def workers_at(address: str) -> int:
             return workers.count
     except UserError:
         return 0
+
+
+@pytest.fixture
+def daemonic(monkeypatch):
+    """Let this process be one that may start no others, as a worker of multiprocessing.Pool."""
+    process: Any = multiprocessing.current_process()
+    monkeypatch.setitem(process._config, "daemon", True)
+
+
+class TestADaemonicProcess:
+    def test_runs_a_campaign_itself_with_a_note(self, daemonic, tmp_path):
+        keywords: dict[str, Any] = {"cases": 20, "seed": 1, "progress": False}
+        alone = api.campaign("design2", out=tmp_path / "alone", **keywords)
+        with pytest.warns(Notice, match="in this process"):
+            run = api.campaign("design2", out=tmp_path / "run", workers=2, **keywords)
+        texts = [(one.folder / OUTCOMES).read_bytes() for one in (alone, run)]
+        assert texts[0] == texts[1]
 
 
 class TestADaskCluster:
