@@ -149,6 +149,18 @@ class TestImports:
         assert loaded & HEAVY_MODULES == set()
 
 
+def test_xml_is_read_without_entities():
+    for module in MODULES:
+        for call in nodes_of(module, ast.Call):
+            name = ast.unparse(call.func)
+            options = {option.arg: ast.unparse(option.value) for option in call.keywords}
+            if name == "etree.XMLParser":
+                assert options.get("resolve_entities") == "False", module
+            if name in ("etree.parse", "etree.fromstring", "etree.XML", "etree.iterparse"):
+                given = len(call.args) == 2 or {"parser", "resolve_entities"} & options.keys()
+                assert given, f"{module}: {name} without a parser"
+
+
 def test_files_are_removed_and_renamed_in_one_module():
     removers = {"rmtree", "rmdir", "unlink", "removedirs", "rename", "renames", "move"}
     removing = set()
