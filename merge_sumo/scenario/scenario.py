@@ -317,9 +317,9 @@ class Scenario:
     def _checks(self) -> Iterator[tuple[str, bool, str]]:
         """Yield (field, whether it fits the others, values that fit)."""
         near = f"starts up to reach_m, {self.reach_m:g} m, before M"
-        yield "headway_behind_s", self.farthest_start_m <= self.reach_m, near
         for name in ("x_pov0_m", "x_vut0_m"):
             yield name, -self.reach_m <= self.bounds(name)[0], near
+        yield "headway_behind_s", self.farthest_start_m <= self.reach_m, near
         speeds = f"speeds up to v_start_max_mps, {self.v_start_max_mps:g}"
         for name in ("v_pov0_mps", "v_vut0_mps"):
             yield name, self.bounds(name)[1] <= self.v_start_max_mps, speeds

@@ -48,6 +48,7 @@ class TestAFile:
             ("x_pov0_m = [-180, -340]", "x_pov0_m is -180..-340: the first number of a range"),
             ("x_pov0_m = -180", "x_pov0_m is -180: it must be two numbers, [low, high]"),
             ("x_pov_m = [-340, -180]", "has no 'x_pov_m': it has "),
+            ("reach_m = 300", "x_pov0_m is (-340.0, -180.0): choose starts up to reach_m, 300 m"),
             ("v_vut0_mps = nan", "v_vut0_mps is nan: choose 0 to 100"),
             ("a_min_mps2 = 3", "a_min_mps2 is 3: choose -20 to -0.01"),
             ("dx_crash_m = 20", "dx_crash_m is 20.0: choose up to dx_critical_m"),
