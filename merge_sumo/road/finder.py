@@ -258,9 +258,11 @@ def _road(
 def _approach(junction: Any, meeting: _Meeting, path: int) -> Approach:
     """Return how a path comes to the junction at which it meets the other one."""
     link, other = meeting.links[path], meeting.links[1 - path]
+    # Also for a lane that ends: a junction that the net lacks has no type.
+    has_lights = junction.getType().startswith("traffic_light")
     if meeting.ending is not None:
         yields = path == meeting.ending
-    elif junction.getType().startswith("traffic_light"):
+    elif has_lights:
         yields = path == RAMP
     else:
         yields = junction.forbids(other.connection, link.connection)
