@@ -14,6 +14,7 @@ from merge_sumo.campaigns.repeatability import (
     read_second_runs,
     unrepeatable,
 )
+from merge_sumo.errors import UserError
 from merge_sumo.reports.report import write_report
 
 REMEMBERS = """
@@ -61,3 +62,12 @@ def test_drivers_of_the_package_and_clients_that_a_user_starts_run_once(run):
     assert cases_for_second_runs(run.outcomes, settings) == []
     started = campaign_settings(vut="traci:python3 client.py {port}")
     assert len(cases_for_second_runs(run.outcomes, started)) == 8
+
+
+def test_a_changed_file_is_refused_by_its_line(run, tmp_path):
+    for name in ("campaign.json", "outcomes.jsonl"):
+        (tmp_path / name).write_bytes((run.folder / name).read_bytes())
+    line = '{"index":3,"differs_from_s":1.5,"end":"MERGED","failed":false,"other_verdict":true}\n'
+    (tmp_path / REPEATS).write_text(line + line.replace("MERGED", "<script>"))
+    with pytest.raises(UserError, match=r"line 2 of .*repeats.jsonl is not as it was written"):
+        read_second_runs(RecordedCampaign(tmp_path))
