@@ -60,6 +60,14 @@ def test_of_a_good_vut_it_says_nothing_wrong_and_what_a_step_costs(check):
             CLASS.format(reset="pass", act="self.shared[0] += 1; return self.shared[0] % 7 * 0.1"),
             "differently",
         ),
+        # A step depends on the number of episodes beside it.
+        (
+            "class Vut:\n    def __init__(self, corridors):\n        pass\n"
+            "    def reset(self, corridor, seen):\n        pass\n"
+            "    def act_batch(self, seen):\n"
+            "        return 0.25 * seen.active.sum() + 0 * seen.t_s\n",
+            "mixes the corridors of `act_batch`",
+        ),
         ("def Vut(seen):\n    return None\n", "16 of 16 ordinary cases end as VUT_ERROR"),
         ("def Vut(seen):\n    return 1.0 / seen.v_vut_mps\n", "From standstill it ends as"),
         ("def Vut(seen):\n    return 0.1 * (seen.v_vut_mps > 1)\n", "it never starts"),
