@@ -247,8 +247,8 @@ def read_distribution(
             known = ", ".join(sorted(even))
             raise UserError(f"levels must give weights to levels of the campaign: {known}")
         total = sum(weights.values())
-        if total == 0.0:
-            raise UserError("levels must have weights that are not all 0")
+        if not 0.0 < total < math.inf:
+            raise UserError("levels must have weights that are not all 0, and a finite sum")
     shares = {int(level): weight / total for level, weight in weights.items() if weight > 0.0}
     return Distribution(shares, marginals, scenario)
 

@@ -154,6 +154,7 @@ class TestADistribution:
         [
             ({"x_pov0": {}}, "'x_pov0'"),
             ({"levels": {"3": 1}}, "levels of the campaign"),
+            ({"levels": {"1": 1e308, "2": 1e308}}, "a finite sum"),
             ({"x_pov0_m": {"kind": "beta"}}, "'beta'"),
             ({"x_pov0_m": {"kind": "uniform", "low": -400}}, "-340 to -180"),
             ({"svo_rad": {"kind": "histogram", "edges": [0, 1], "weights": [1, 1]}}, "3 edges"),
