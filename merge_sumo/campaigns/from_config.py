@@ -98,7 +98,7 @@ def _new_settings(named: dict[str, Any]) -> CampaignSettings:
     """Return settings, by default with the criterion of the scenario."""
     if "require" not in named:
         named.setdefault("fail_when", named["scenario"].criterion)
-    return CampaignSettings(**named)
+    return CampaignSettings(**{"vut": ""} | named)  # which says that a VUT is missing
 
 
 ONE: dict[str, Any] = {

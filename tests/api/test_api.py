@@ -69,6 +69,7 @@ def test_a_name_that_is_not_there_is_an_attribute_error():
     [
         ("campaign", {"seed": 1.5}, "seed is 1.5: it must be a whole number"),
         ("campaign", {"cases": 0}, "`cases`"),
+        ("campaign", {"vut": None}, "name the vehicle under test"),
         ("campaign", {"workers": "2"}, "workers is '2': give a number of processes"),
         ("campaign", {"workers": 0}, "`workers` is 0: it must be a whole number, 1 or more"),
         ("run", {"x_pov0_m": "a", "v_pov0_mps": 30.0}, "x_pov0_m is 'a': it must be a number"),
@@ -81,7 +82,7 @@ def test_a_wrong_value_is_one_sentence_and_leaves_nothing(
 ):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(UserError) as refused:
-        getattr(ms, verb)("design2", **values)
+        getattr(ms, verb)(values.pop("vut", "design2"), **values)
     (line,) = refused.value._render_traceback_()  # as a notebook shows it
     assert sentence in line
     assert list(tmp_path.iterdir()) == []
