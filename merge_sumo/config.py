@@ -5,8 +5,8 @@ it was recorded. An option has the name of its field, unless `FLAGS` gives anoth
 
 A field of `ScenarioChanges` has the name of a field of `Scenario`, which it replaces
 (`from_config.scenario_from`). One of `Search`, `FailureRule` or `Limits` is a field of
-`CampaignSettings`; `load_plan` gives it to `SimulationPlan`, or to its controllers as one of
-`ControllerOptions`.
+`CampaignSettings`. `load_plan` gives the criterion to `SimulationPlan`, and the limits to its
+controllers, as `ControllerOptions`.
 """
 
 from __future__ import annotations
@@ -370,7 +370,7 @@ class Probability(EngineChoice, StudyOptions):
     cases: int | None = None
     """Fresh cases to run; by default 100000 without SUMO, 4000 in it."""
     traffic: AnyPath | None = None
-    """With how many cars a merge fails in a traffic: exid-2, exid-3, exid-5, or a TOML file with
+    """State the failures per merge in a traffic: exid-2, exid-3, exid-5, or a TOML file with
     density and speeds."""
     distribution: AnyPath | None = None
     """JSON: how often cases occur; uniformly by default."""

@@ -273,7 +273,7 @@ def open_workers(workers: AnyWorkers = AUTO) -> Workers:
         workers: number, address, or "auto".
 
     Raises:
-        UserError: there is no cluster at the address, or the value is neither of them.
+        UserError: there is no cluster at the address, or the value is none of these.
     """
     if isinstance(workers, str) and workers != AUTO:
         return dask_workers(workers)
