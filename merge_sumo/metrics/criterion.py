@@ -15,6 +15,7 @@ from merge_sumo.errors import UserError
 from merge_sumo.metrics.bodies import CentreLines
 from merge_sumo.metrics.expression import Condition, Value, Vocabulary, parse_condition
 from merge_sumo.metrics.measures import (
+    FOLLOW_UP,
     MEASURES,
     Measures,
     known_measures,
@@ -118,9 +119,11 @@ class Criterion:
         missing = condition_of(self.condition).names - recorded_measures(scenario).keys()
         if missing:
             name = min(missing)
+            needs = MEASURES[name].only_with
+            how = ", or a `follow_up_s` above 0" if needs == FOLLOW_UP else ""
             raise UserError(
-                f"`fail_when` speaks of {name}, which needs {MEASURES[name].only_with}: choose "
-                f"another scenario than {scenario.name}, or a `follow_up_s` above 0"
+                f"`fail_when` speaks of {name}, which needs {needs}: choose another scenario than "
+                f"{scenario.name}{how}"
             )
 
     @property

@@ -202,7 +202,7 @@ def regions(points: ArrayLike, radius: float | None = None) -> IntArray:
         ValueError: points of another shape or dimension, or points that are not finite.
     """
     cases = _checked(points)
-    limit = (radius or radius_for(cases.shape[1])) * (1.0 + SLACK)
+    limit = (radius_for(cases.shape[1]) if radius is None else radius) * (1.0 + SLACK)
     pairs = cKDTree(cases).query_pairs(limit, output_type="ndarray")
     links = coo_array((np.ones(len(pairs)), pairs.T), shape=(len(cases), len(cases)))
     # Numbered in the order of their first point.

@@ -153,10 +153,10 @@ def measure(
 class Measures:
     """Named measures of one episode.
 
-    dx, dv, TTC, DRAC and the order of merging are taken at t1, the first step with x_VUT >= 0, and
-    are None when the VUT never arrived. In traffic they are of the car of the mainline that is
-    nearest to the VUT at the end. Severity, clearance, bumper gap, braking after M, and impact
-    speed are of all cars.
+    dx, dv, TTC, DRAC and the order of merging are taken at t1, the first step with x_VUT >= 0, or
+    with an acceleration lane the step of the merge; they are None when the VUT never arrived. In
+    traffic they are of the car of the mainline that is nearest to the VUT at the end. Severity,
+    clearance, bumper gap, braking after M, and impact speed are of all cars.
 
     A measure is computed when it is first read, or by `compute_all`. Recorded measures have no
     trajectory.

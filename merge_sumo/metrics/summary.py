@@ -228,7 +228,7 @@ class LevelSummary:
 
     Attributes:
         cases: cases that ran.
-        tested: cases in which the VUT reached the merge point.
+        tested: cases that are judged (`Outcome.is_tested`).
         failures: failing cases, without the undecided ones.
         fmc: failure mode coverage of the failing cases, decided or not, in the unit cube of the
             level; M(s, 0.05, -500) under the paper's criterion in up to three coordinates.
@@ -273,10 +273,10 @@ class Summary:
         failures: failing cases, without the undecided ones.
         contacts: failures in which bodies touch at or after the merge point.
         errors: cases that ended as VUT_ERROR or SIM_ERROR.
-        timeouts: cases in which the VUT never reached its goal.
+        timeouts: cases in which the VUT never reached its goal, unless that is a failure.
         undecided_cases: deciding runs, by index, of failing cases with too few runs to decide.
         error_groups: errors and timeouts by message: errors first, then the most frequent.
-        goal: place that the VUT reaches in a case that is tested.
+        goal: place that the VUT is to reach.
         levels: summaries of POV levels.
 
     Example:
@@ -302,7 +302,7 @@ class Summary:
 
     @property
     def tested(self) -> int:
-        """Number of cases in which the VUT reached its goal."""
+        """Number of cases that are judged (`Outcome.is_tested`)."""
         return self.cases - self.errors - self.timeouts
 
     @property

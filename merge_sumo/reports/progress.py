@@ -103,7 +103,7 @@ class Bars:
         finished, elapsed_s = done - bar.before, now_s - bar.start_s
         if finished > 0 and elapsed_s > 0.0:
             per_s = finished / elapsed_s
-            parts.append(f"{per_s:.3g} {unit}/s")
+            parts.append(f"{per_s:,.2f} {unit}/s")
             if done < total:
                 parts.append(f"{timedelta(seconds=round((total - done) / per_s))} left")
         text = "  ".join(filter(None, parts))

@@ -140,6 +140,7 @@ class TestRegions:
         assert not (np.diff(axis) <= 0.05).all()  # rounding
         assert set(regions(axis[:, None])) == {0}
         assert regions([[0.0], [0.0501]]).tolist() == [0, 1]
+        assert regions([[0.1], [0.11]], radius=0.0).tolist() == [0, 1]
 
 
 def test_the_balls_around_failures_cover_places_within_the_radius_inclusively():

@@ -56,11 +56,11 @@ def test_without_a_terminal_a_line_at_the_begin_every_minute_and_at_the_end(run,
     assert len(lines) == 5
     assert lines[0].startswith("cases: 0/180  ")
     assert lines[1].startswith("cases: 120/180  ")
-    assert lines[1].endswith("  2 cases/s  0:00:30 left")
+    assert lines[1].endswith("  2.00 cases/s  0:00:30 left")
     assert lines[2:] == [
-        f"cases: 180/180  {found}  2 cases/s",
+        f"cases: 180/180  {found}  2.00 cases/s",
         "careful drivers: 0/40  ",
-        "careful drivers: 40/40  2 failures/s",
+        "careful drivers: 40/40  2.00 failures/s",
     ]
 
 

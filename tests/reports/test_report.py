@@ -73,7 +73,9 @@ class TestThePage:
         assert root.xpath("//@style") == []
 
     def test_shows_what_comes_from_outside_as_text(self, tmp_path):
-        run = write_run(tmp_path / "run", vut=EVIL, errors={179: EVIL}, sampler=EVIL)
+        run = write_run(
+            tmp_path / f"run{report_model.INDEX}", vut=EVIL, errors={179: EVIL}, sampler=EVIL
+        )
         page = report_page(ReportModel(run, learns=False))
         root = root_of(page)
         assert len(root.xpath("//script")) == 2
