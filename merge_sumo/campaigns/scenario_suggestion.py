@@ -123,8 +123,11 @@ def about(road: Road) -> list[str]:
         lines.append(f"lane next to the mainline, not used as an acceleration lane: {ends}")
     lines.append(f"{merge}, junction {road.junction_type}")
     yields = road.mainline_approach.yields, road.ramp_approach.yields
-    first = {(True, False): "the ramp goes", (False, True): "the mainline goes"}
-    lines.append(f"right of way: {first.get(yields, 'neither road goes')} first")
+    first = {
+        (True, False): "the ramp goes first (are mainline and ramp exchanged?)",
+        (False, True): "the mainline goes first",
+    }
+    lines.append(f"right of way: {first.get(yields, 'neither road goes first')}")
     if road.lane_drop:
         lines.append("one path comes to M on a lane that ends")
     return lines

@@ -161,11 +161,16 @@ def test_an_odd_net_is_taken_by_every_kind_of_controller_and_export(tmp_path, us
 
 
 @pytest.mark.parametrize(
-    ("name", "first"),
-    [("priority", "the mainline goes first"), ("zipper", "neither road goes first")],
+    ("name", "order", "first"),
+    [
+        ("priority", 1, "the mainline goes first"),
+        ("priority", -1, "the ramp goes first (are mainline and ramp exchanged?)"),
+        ("zipper", 1, "neither road goes first"),
+    ],
 )
-def test_a_road_has_its_right_of_way_and_its_limits_after_m(tmp_path, name, first):
-    build, mainline, ramp = FOREIGN[name]
+def test_a_road_has_its_right_of_way_and_its_limits_after_m(tmp_path, name, order, first):
+    build, *edges = FOREIGN[name]
+    mainline, ramp = edges[::order]
     net = build(tmp_path)
     net.write_text(re.sub(r'(id="out_\d" .*?speed=)"[\d.]+"', r'\1"1.39"', net.read_text()))
     lines = api.new_scenario(tmp_path / "a.toml", net=net, mainline=mainline, ramp=ramp).lines()
