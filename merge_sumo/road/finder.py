@@ -165,7 +165,9 @@ def find_road(
         with explained(f"the net {road_net.path} cannot host a merge"):
             return _road(road_net, edges, edge_at_m, room_after_m, lane_m)
     except INVALID as error:
-        raise UserError(f"{road_net.path} is not a valid SUMO net ({error!r:.200})") from error
+        raise UserError(
+            f"{road_net.path} is not a valid SUMO net ({error!r:.200}): make it again by netconvert"
+        ) from error
 
 
 class _Link(NamedTuple):
