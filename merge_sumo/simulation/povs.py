@@ -206,13 +206,13 @@ class PovLibrary(Driver):
         self._level[corridor] = case.level
 
     def act(self, scene: Scene) -> FloatArray:
-        """Return the answer of the driver of each corridor, (K,)."""
+        """Return the answer of the driver of each corridor, (K,); 0 where no episode runs."""
         acceleration = np.zeros(self.corridors)
         for level, driver in self._drivers.items():
-            plays = self._level == level
+            plays = scene.active & (self._level == level)
             if plays.any():
-                of_level = scene._replace(active=scene.active & plays)
-                np.copyto(acceleration, driver.act(of_level), where=plays)
+                answer = driver.act(scene._replace(active=plays))
+                np.copyto(acceleration, answer, where=plays)
         return acceleration
 
     def reason(self, corridor: int) -> str | None:

@@ -110,6 +110,20 @@ class TestAPov:
         alone = run(spec, [case for case in cases if case.level == OWN], vut="sumo:IDM")
         assert same([motion for motion in mixed if motion.case.level == OWN], alone)
 
+    def test_is_asked_only_while_it_drives(self):
+        source = """
+class Pov:
+    def __init__(self, corridors):
+        pass
+    def act_batch(self, seen):
+        if not seen.active.any():
+            open("idle", "w")
+        return 0.0 * seen.t_s
+"""
+        cases = cases_of(2)  # the first one ends last
+        run(pov(source), [cases[0], *own(cases[1:])])
+        assert not Path("idle").exists()
+
 
 CASES = own([case for k, case in enumerate(cases_of(6)) if k != 4])
 
