@@ -192,9 +192,10 @@ SENDS = "s = traci.getConnection()._socket\ns.sendall({!r})\ns.recv(1)"
             "not TraCI: a message of 2147483647 bytes was announced",
         ),
         ("traci.vehicle.setSpeed('vut', float('nan'))", "commanded vehicle.setSpeed(nan)"),
+        ("traci.simulationStep(float('nan'))", "the controller stepped to time nan"),
         (SENDS.format(b"\0\0\0\x20\x05"), "sent half a message and no more within the deadline"),
     ],
-    ids=["crashes", "says goodbye", "a huge message", "nan", "half a message"],
+    ids=["crashes", "says goodbye", "a huge message", "nan", "time nan", "half a message"],
 )
 def test_a_program_that_does_wrong_is_started_again_and_leaves_nothing(tmp_path, misdeed, reason):
     command = program(
@@ -266,7 +267,7 @@ def test_a_port_that_is_invalid_or_taken_is_refused(capfd):
         port = server.getsockname()[1]
         with pytest.raises(UserError, match=f"cannot listen on 127.0.0.1:{port}"):
             run_cases(factory(f"traci:{port}"), cases_of(1))
-    with pytest.raises(UserError, match=r"no TraCI client connected .* in 0.2 s"):
+    with pytest.raises(UserError, match=r"no TraCI client of yours connected .* in 0.2 s"):
         run_cases(factory(f"traci:{free_port()}", connect_s=0.2), cases_of(1))
     assert "waiting up to 0.2 s for a TraCI client on 127.0.0.1:" in capfd.readouterr().err
 

@@ -52,7 +52,7 @@ class Reply(msgspec.Struct, omit_defaults=True):
         merge: whether the VUT requests to leave the acceleration lane.
         by_sumo: whether SUMO's own driver chose the speed.
         fault: the client's fault; "" without one.
-        closed: whether the client has closed it while the VUT was not on the road.
+        closed: whether the client has closed its connection while the VUT was not on the road.
         refused: why the process cannot carry out the request; "" if it did.
         in_vain: commands of the episode that changed nothing.
     """
@@ -281,6 +281,8 @@ class Server:
         session.answered()
         if target_s == 0.0 or target_s > sumo.time_s + ROUNDING_S:
             self._target_s = target_s
+        elif math.isnan(target_s):
+            raise FaultError("the controller stepped to time nan")
         else:
             self._answers += status(STEP) + session.results()
 

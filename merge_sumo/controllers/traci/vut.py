@@ -293,7 +293,7 @@ class TraciDriver(ControllerDriver):
                     f"waiting up to {patience_s:g} s for a TraCI client on {HOST}:{port}\n"
                 )
             if not self._accept(patience_s):
-                reason = f"no TraCI client connected to {HOST}:{port} in {patience_s:g} s"
+                reason = f"no TraCI client of yours connected to {HOST}:{port} in {patience_s:g} s"
                 if self._program is not None:
                     reason += (
                         ": the command is told the port as {port} and in MERGE_SUMO_PORT, for "
