@@ -87,7 +87,7 @@ class Output:
 
 
 def _is_writable_log(log: Path) -> bool:
-    """Return whether a log is a file, or does not exist yet."""
+    """Return whether a log is a file and no link, or does not exist yet."""
     return not log.is_symlink() and (log.is_file() or not log.exists())
 
 

@@ -171,7 +171,9 @@ class PythonObjectKind(ControllerKind):
         except UserError:
             raise
         except (Exception, SystemExit) as error:
-            how = "made" if self._is_class else "copied for each corridor (give its class)"
+            how = "copied for each corridor (give its class)"
+            if self._is_class:
+                how = f"made with {corridors[0]} corridors" if corridors else "made"
             why = f"{type(error).__name__}: {text_of(error)}"
             raise UserError(f"{self.spec} cannot be {how}: {why}") from error
         return made

@@ -152,6 +152,12 @@ def test_what_cannot_be_a_vut_is_refused_in_a_sentence(write_vut, source, name, 
     assert said in str(refused.value)
 
 
+def test_a_batched_class_that_takes_no_number_of_corridors_is_told_of_it(write_vut):
+    batched = "class Vut:\n    def act_batch(self, seen):\n        return seen.t_s\n"
+    with pytest.raises(UserError, match="cannot be made with 2 corridors: TypeError"):
+        in_process(write_vut(batched)).open(2)
+
+
 def test_the_example_of_the_tutorial_drives(write_vut):
     page = Path(__file__).parents[2] / "docs" / "tutorials" / "python-vut.md"
     text = page.read_text(encoding="utf-8")
