@@ -10,8 +10,9 @@ import os
 import signal
 import site
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
+from functools import partial
 from multiprocessing.connection import Connection
 from pathlib import Path
 from time import perf_counter
@@ -121,16 +122,17 @@ class _Host:
     def serve(self) -> None:
         """Load the controller, then answer request by request."""
         Deadline.before_call = self._beat
-        request = HostRequest("make")  # never sent: the first reply is to none
-        self._answer(request, self._load)
-        while request.action != "close":
+        self._answer(self._load)
+        is_open = True
+        while is_open:
             request = decode_request(self._connection.recv_bytes())
-            self._answer(request, getattr(self, f"_{request.action}"))
+            self._answer(partial(getattr(self, f"_{request.action}"), request))
+            is_open = request.action != "close"
 
-    def _answer(self, request: HostRequest, action: Any) -> None:
+    def _answer(self, action: Callable[[], HostReply]) -> None:
         process = os.getpid()
         try:
-            reply = action(request)
+            reply = action()
         except (UserError, EpisodesLostError) as error:
             failed = printable(str(error))  # names of files may not be valid text
             reply = HostReply(failed=failed, is_finding=isinstance(error, ControllerError))
@@ -140,7 +142,7 @@ class _Host:
             os._exit(0)  # the controller forked, and this is the copy
         self._connection.send_bytes(encode(reply))
 
-    def _load(self, _request: HostRequest) -> HostReply:
+    def _load(self) -> HostReply:
         settings = self._settings
         spec = msgspec.convert(settings["spec"], ControllerSpec)
         options = ControllerOptions(deadline_s=settings["deadline_s"])
