@@ -273,7 +273,7 @@ class Measures:
 
     @measure(worse="low", label="time to collision", column="TTC")
     def ttc_s(self) -> float | None:
-        """Time to collision -dx/dv where dx dv < 0, else None (infinite)."""
+        """Time to collision of the front bumpers, -dx/dv where dx dv < 0, else None (infinite)."""
         dx, dv = self.dx_m, self.dv_mps
         return None if dx is None or dv is None else time_to_collision(dx, dv)
 
@@ -361,34 +361,34 @@ class Measures:
 
     @measure(
         worse="high",
-        label="hardest braking of the VUT",
+        label="hardest braking of the VUT up to M",
         column="VUT brakes",
         default=0.0,
     )
     def vut_max_brake_mps2(self) -> float:
-        """Hardest braking of the VUT, positive."""
+        """Hardest braking of the VUT up to t1, positive."""
         return max(0.0, -float(self.trajectory.a_vut_mps2.min()))
 
     @measure(
         worse="high",
-        label="hardest braking of the POV",
+        label="hardest braking of the POV up to M",
         column="POV brakes",
         default=0.0,
     )
     def pov_max_brake_mps2(self) -> float:
-        """Hardest braking of the POV, positive."""
+        """Hardest braking of the POV up to t1, positive."""
         return max(0.0, -float(self.trajectory.motion[:, self.trajectory.nearest, 2].min()))
 
     @measure(
         worse="high",
-        label="braking of the POV over 1.6 s",
+        label="braking of the POV over 1.6 s up to M",
         column="POV brakes over 1.6 s",
     )
     def pov_sustained_brake_mps2(self) -> float | None:
-        """Largest mean deceleration of the POV over 1.6 s, or over a shorter episode."""
+        """Largest mean deceleration of the POV over 1.6 s up to t1, or over a shorter episode."""
         return sustained_brake_mps2(self.trajectory.motion[:, self.trajectory.nearest, 1])
 
-    @measure(worse="high", label="slow-down of the POV", column="POV slows by")
+    @measure(worse="high", label="slow-down of the POV up to M", column="POV slows by")
     def pov_slowdown_mps(self) -> float | None:
         """Largest loss of speed of the POV up to t1, from the highest speed before."""
         v_mps = self.trajectory.motion[:, self.trajectory.nearest, 1]
