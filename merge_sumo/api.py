@@ -19,7 +19,7 @@ import inspect
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, fields, replace
-from functools import cache, partial, update_wrapper
+from functools import cache, partial, update_wrapper, wraps
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
@@ -73,7 +73,7 @@ from merge_sumo.interrupt import Stopped
 from merge_sumo.metrics.merge import check_from
 from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.metrics.summary import parse_gates
-from merge_sumo.printable import printable, quoted
+from merge_sumo.printable import either, meant, printable, quoted
 from merge_sumo.records import check_toml_size, to_plain
 from merge_sumo.reports import figures
 from merge_sumo.reports.cases_toml import with_file
@@ -102,6 +102,41 @@ __all__ = ["AnyVut", "CampaignRun", "Car", "CaseRun", "Seen", "SeenBatch", "date
 P = ParamSpec("P")
 C = TypeVar("C")
 R = TypeVar("R")
+SIGNATURES: dict[str, inspect.Signature] = {}
+"""Arguments of each function, by its name."""
+
+
+def checked(function: Callable[P, R], name: str = "") -> Callable[P, R]:
+    """Decorate a function so that wrong arguments raise a `UserError`.
+
+    Args:
+        function: the function.
+        name: what users call it; by default its name.
+    """
+    name, signature = name or function.__name__, inspect.signature(function)
+    SIGNATURES[name] = signature
+
+    @wraps(function)
+    def call(*args: P.args, **kwargs: P.kwargs) -> R:
+        for keyword in kwargs:
+            if keyword not in signature.parameters:
+                raise UserError(_unknown_keyword(name, keyword))
+        try:
+            signature.bind(*args, **kwargs)
+        except TypeError as error:
+            raise UserError(f"{name}: {error}") from error
+        return function(*args, **kwargs)
+
+    return call
+
+
+def _unknown_keyword(name: str, keyword: str) -> str:
+    """Return a sentence on a keyword that a function does not have."""
+    others = [verb for verb, known in SIGNATURES.items() if keyword in known.parameters]
+    where = f", which {either(sorted(others))} has" if others else ""
+    own = SIGNATURES[name].parameters
+    hint = meant(keyword, own) or f"choose {', '.join(own) or 'none'}"
+    return f"{name} has no keyword `{keyword}`{where}: {hint}".rstrip()
 
 
 def verb(config: Callable[P, C]) -> Callable[[Callable[[C], R]], Callable[P, R]]:
@@ -115,10 +150,12 @@ def verb(config: Callable[P, C]) -> Callable[[Callable[[C], R]], Callable[P, R]]
     """
 
     def decorated(work: Callable[[C], R]) -> Callable[P, R]:
+        made = checked(config, work.__name__)
+
         def call(*args: P.args, **kwargs: P.kwargs) -> R:
             # One thread: products are small, and the cores are for workers.
             with threadpool_limits(1):
-                return work(config(*args, **kwargs))
+                return work(made(*args, **kwargs))
 
         update_wrapper(call, work)
         # What `help` shows.
@@ -184,6 +221,7 @@ def resume(config: c.Resume) -> CampaignRun:
     return run_and_report(settings, settings.load_plan(), folder, config, resumes=True)
 
 
+@checked
 def open_run(folder: c.AnyPath) -> CampaignRun:
     """Open the folder of a campaign.
 
@@ -280,6 +318,7 @@ def export(config: c.Export) -> list[Path]:
     return export_cases(run, wanted, config.file_format, path_of(config.out))
 
 
+@checked
 def report(run: c.AnyRun) -> Shown:
     """Write the report of a campaign again, and return its facts; as `merge-sumo report`.
 
@@ -291,6 +330,7 @@ def report(run: c.AnyRun) -> Shown:
     return Shown({"report": path, "facts": to_plain(opened_run.facts)}, [path])
 
 
+@checked
 def replay(folder: c.AnyRun, index: int | None = None, *, from_s: float | None = None) -> Replay:
     """Replay a case in SUMO and compare every row with its record; as `merge-sumo replay`.
 
@@ -305,6 +345,7 @@ def replay(folder: c.AnyRun, index: int | None = None, *, from_s: float | None =
     return replayer.replay(_scenario_folder(folder, index), from_s)
 
 
+@checked
 def open_in_gui(folder: c.AnyRun, index: int | None = None, *, from_s: float | None = None) -> None:
     """Show a case in sumo-gui until the window is closed.
 
@@ -444,6 +485,7 @@ def check_vut(config: c.CheckVut) -> vut_check.VutCheck:
         return vut_check.check_vut(settings)
 
 
+@checked
 def scenarios() -> Shown:
     """Return the scenarios that the package brings, by name; as `merge-sumo scenario list`."""
     return own_scenario.shipped()

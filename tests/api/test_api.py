@@ -88,6 +88,25 @@ def test_a_wrong_value_is_one_sentence_and_leaves_nothing(
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize(
+    ("call", "sentence"),
+    [
+        (
+            lambda: ms.probability("run", level=1),  # type: ignore[call-arg]
+            "benchmark, campaign, rerun, resume, run or truth has: choose run, ",
+        ),
+        (lambda: ms.campaign("design2", casse=3), "no keyword `casse`: did you mean "),  # type: ignore[call-arg]
+        (lambda: ms.scenarios(vut="a"), ", campaign, "),  # type: ignore[call-arg]
+        (lambda: ms.open_run("a", xyz=1), "`xyz`: choose folder"),  # type: ignore[call-arg]
+        (ms.truth, "truth: missing a required argument: 'vut'"),
+    ],
+)
+def test_a_keyword_of_another_function_is_refused_with_the_functions_that_have_it(call, sentence):
+    with pytest.raises(UserError) as refused:
+        call()
+    assert sentence in str(refused.value)
+
+
 def test_two_campaigns_of_a_second_have_folders_of_their_own(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for _ in range(3):
