@@ -20,8 +20,9 @@ from merge_sumo.reports.pages import ERROR_CHARACTERS
 from merge_sumo.reports.report_model import ReportModel
 from merge_sumo.reports.text import causes, changes, name_and_unit
 from merge_sumo.road.drawing import road_data
+from merge_sumo.road.road import Road
 from merge_sumo.scenario.case import FloatArray, to_unit
-from merge_sumo.scenario.scenario import ALL_LEVELS, DT_S, VEHICLES, level_name
+from merge_sumo.scenario.scenario import ALL_LEVELS, DT_S, VEHICLES, Scenario, level_name
 from merge_sumo.scenario.signals import to_runs
 from merge_sumo.scenario.trajectory import Trajectory
 
@@ -47,7 +48,7 @@ def page_data(model: ReportModel) -> dict[str, Any]:
         report.js makes the table All cases of it, with a column for each entry of `measures`.
         `speeds` is as `packed` returns it.
     """
-    scenario, lane_m = model.run.scenario, model.run.scenario.lane_m
+    scenario = model.run.scenario
     speeds, offsets = packed(model.motion)
     cause_of = causes(model.run, model.shown)
     cases: dict[str, list[Any]] = {"index": []}
@@ -71,40 +72,65 @@ def page_data(model: ReportModel) -> dict[str, Any]:
         axis = {"name": c.name, "unit": c.unit, "digits": c.digits, "near": near}
         axes.append(axis | {"field": c.field, "low": c.low, "high": c.high})
     return {
-        "dt": DT_S,
-        "crash_m": scenario.dx_crash_m,
         "varies": model.varies,
-        "lane": lane_m,
-        "place": "M" if lane_m is None else scenario.place,
-        "vehicles": VEHICLES[: scenario.vehicles],
+        "place": "M" if scenario.lane_m is None else scenario.place,
         "level_names": {level: level_name(level) for level in ALL_LEVELS},
         "coordinates": axes,
         "severities": list(Severity),
         "measures": measures,
         "cases": cases,
         "speeds": speeds,
-        "speed_unit_mps": SPEED_UNIT_MPS,
         "signals": {i: to_runs(t.signals) for i, t in model.motion.items() if t.signals},
         "why": _explanations(model),
         "boxes": [{"level": box.level, "cases": box.indices} for box in model.boxes],
         "maps": {level: _map(model, level) for level in model.levels},
         "search": _search(model),
-        **road_data(model.road),
+        **player_data(scenario, model.road),
+    }
+
+
+def player_data(scenario: Scenario, road: Road) -> dict[str, Any]:
+    """Return what player.js reads apart from cases and speeds.
+
+    Args:
+        scenario: the scenario of the cases.
+        road: its road.
+    """
+    return {
+        "dt": DT_S,
+        "crash_m": scenario.dx_crash_m,
+        "lane": scenario.lane_m,
+        "vehicles": VEHICLES[: scenario.vehicles],
+        "speed_unit_mps": SPEED_UNIT_MPS,
+        **road_data(road),
+    }
+
+
+def motion_row(outcome: Outcome, motion: Trajectory | None) -> dict[str, Any]:
+    """Return what player.js reads of a case, apart from its first row in the speeds.
+
+    Args:
+        outcome: the outcome of the case.
+        motion: its motion; None where it is lost, which gives 0 rows.
+    """
+    return {
+        "index": outcome.index,
+        "starts": [round(x_m, 3) for x_m, _ in outcome.case.starts()],
+        "nearest": VEHICLES.index(outcome.measures.nearest),
+        "rows": 0 if motion is None else len(motion.whole),
+        "end": outcome.measures.end,
+        "t_end_s": outcome.measures.t_end_s,
     }
 
 
 def _row(model: ReportModel, outcome: Outcome) -> dict[str, Any]:
-    """Return a case by the names of `cases`; `rows` is 0 where its motion is lost."""
+    """Return a case by the names of `cases`."""
     index, measures = outcome.index, outcome.measures
     motion, diagnosis = model.motion.get(index), model.diagnoses.get(index)
     row: dict[str, Any] = {
-        "index": index,
+        **motion_row(outcome, motion),
         "level": outcome.case.level,
-        "starts": [round(x_m, 3) for x_m, _ in outcome.case.starts()],
-        "nearest": VEHICLES.index(measures.nearest),
-        "rows": 0 if motion is None else len(motion.whole),
         "conflict": None if motion is None else [*Conflict.of(motion)],
-        "end": measures.end,
         "error": measures.error and shortened(measures.error, ERROR_CHARACTERS),
         "severity": measures.severity,
         "failed": outcome.failed,

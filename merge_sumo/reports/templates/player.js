@@ -85,28 +85,34 @@ function range(values, pad = 0.06) {
 }
 
 /* ---------- road, motion, charts ---------- */
-const slider = byId("time"), view = new TopView(byId("road"));
+const slider = byId("time"), views = [...document.querySelectorAll(".view svg")].map((svg) => new TopView(svg));
 let moving = null, step = 0, final = 0, playing = false, last = 0, charts = [];
-function animate(first, flags, more) { // flags: who begins to brake, and when; more: further charts up to a time
+// flags: who begins to brake, and when; more: further charts up to a time; earlier: the motion with
+// another version, in a view of its own, and behind the other in the charts.
+function animate(first, flags, more, earlier = null) {
   const { v, x, met, rows, merge, until } = moving = first;
   const over = (values) => values.map((value, t) => [t * DT, value]);
-  const lines = (values) => vehicles.map((name, who) => ({ name, points: over(values[who]) }));
+  const lines = (name) => [[earlier, " earlier"], [first, ""]].flatMap(([motion, which]) => (motion === null ? [] : vehicles.map((car, who) => ({ name: car + which, points: over(motion[name][who]) }))));
+  const all = (name) => [...first[name], ...(earlier?.[name] ?? [])].flat();
   const others = vehicles.map((_, who) => who).filter((who) => who !== VUT);
-  const gap = x.map((places) => places.map((place, t) => place - x[VUT][t]));
-  const inView = range([...gap[met], -12, 12]); // of the car that the VUT meets
-  final = rows - 1;
+  const gapOf = (motion) => motion.x.map((places) => places.map((place, t) => place - motion.x[VUT][t]));
+  const gap = gapOf(first), before = earlier && gapOf(earlier);
+  const inView = range([...gap[met], ...(before?.[earlier.met] ?? []), -12, 12]); // of the car that the VUT meets
+  const gaps = (values, which) => others.map((who) => ({ name: (others.length > 1 ? vehicles[who] : "gap") + which, points: over(values[who]).filter(([, y]) => y >= inView[0] && y <= inView[1]) }));
+  final = Math.max(rows, earlier?.rows ?? 0) - 1;
   const end = final * DT, common = { xRange: [0, end], xLabel: "time, s", merged: until < final ? until * DT : null };
   charts = [
-    plot(byId("chart-speed"), { ...common, yRange: range(v.flat(), 0.14), lines: lines(v), flags: flags.map(([who, t]) => ({ name: vehicles[who], x: t, y: v[who][Math.round(t / DT)] })) }),
-    plot(byId("chart-position"), { ...common, yRange: range(x.flat()), lines: lines(x), windows: LANE ? [LANE] : [], dots: merge === null ? [] : [{ name: "merged", x: until * DT, y: merge }] }),
+    plot(byId("chart-speed"), { ...common, yRange: range(all("v"), 0.14), lines: lines("v"), flags: flags.map(([who, t]) => ({ name: vehicles[who], x: t, y: v[who][Math.round(t / DT)] })) }),
+    plot(byId("chart-position"), { ...common, yRange: range(all("x")), lines: lines("x"), windows: LANE ? [LANE] : [], dots: merge === null ? [] : [{ name: "merged", x: until * DT, y: merge }] }),
     plot(byId("chart-gap"), {
       ...common, yRange: inView, bands: [[-CRASH, CRASH]],
-      lines: others.map((who) => ({ name: others.length > 1 ? vehicles[who] : "gap", points: over(gap[who]).filter(([, y]) => y >= inView[0] && y <= inView[1]) })),
+      lines: [...(before ? gaps(before, " earlier") : []), ...gaps(gap, "")],
     }),
     ...more(end),
   ];
   slider.max = final;
-  view.show();
+  const motions = earlier === null ? [first] : [earlier, first];
+  views.forEach((view, n) => view.show(motions[n]));
 }
 const extent = (values) => [Math.min(...values), Math.max(...values)];
 function pose(path, along) { // front bumper at a lane coordinate of a path
@@ -120,7 +126,8 @@ function pose(path, along) { // front bumper at a lane coordinate of a path
 function TopView(svg) {
   const cars = {};
   this.cars = cars;
-  this.show = () => {
+  this.show = (motion) => {
+    this.moving = motion;
     svg.replaceChildren();
     // A lane is 3.2 m wide: what is left free between two lanes is the line between them.
     for (const lane of [data.main, data.ramp]) draw(svg, "path", { class: "lane", d: path(lane.map(([, x, y]) => [x, -y])), "stroke-width": 3.05 });
@@ -141,10 +148,10 @@ function TopView(svg) {
     const inside = data.ramp.filter(([at]) => at > begin && at < end).map(([at]) => at);
     const points = [begin, ...inside, end].map((at) => pose(data.ramp, at));
     draw(svg, "path", { class: "window", d: path(points.map(({ x, y }) => [x, -y])), "stroke-width": 3.05 });
-    if (moving.merge !== null) across("merge", data.main, data.ramp, Math.min(moving.merge, end));
+    if (this.moving.merge !== null) across("merge", data.main, data.ramp, Math.min(this.moving.merge, end));
   };
-  this.at = (t) => {
-    const { rows, x: xs, v: vs, merge, until } = moving, k = Math.min(Math.floor(t), Math.max(rows - 2, 0)), next = Math.min(k + 1, rows - 1);
+  this.at = (time) => {
+    const { rows, x: xs, v: vs, merge, until } = this.moving, t = Math.min(time, rows - 1), k = Math.min(Math.floor(t), Math.max(rows - 2, 0)), next = Math.min(k + 1, rows - 1);
     const mix = (values) => values[k] + (t - k) * (values[next] - values[k]); // between two rows
     const merged = merge !== null && t >= until;
     const places = xs.map((x, who) => pose(who === VUT && !merged ? data.ramp : data.main, mix(x)));
@@ -176,7 +183,7 @@ function TopView(svg) {
 function at(t) {
   if (!moving) return;
   step = clamp(t, 0, final);
-  view.at(step);
+  for (const view of views) if (view.moving) view.at(step);
   slider.value = Math.round(step);
   slider.setAttribute("aria-valuetext", `${fixed(step * DT, 1)} seconds`);
   byId("time-value").textContent = `${fixed(step * DT, 1)} s`;
