@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from merge_sumo.analysis.surface import Grid, Surface, nodes
+from merge_sumo.metrics.bodies import WIDTH_M
 from merge_sumo.metrics.fmc import fmc_growth, radius_for
 from merge_sumo.metrics.measures import recorded_measures
 from merge_sumo.metrics.merge import Conflict, Severity
@@ -101,6 +102,8 @@ def player_data(scenario: Scenario, road: Road) -> dict[str, Any]:
         "crash_m": scenario.dx_crash_m,
         "lane": scenario.lane_m,
         "vehicles": VEHICLES[: scenario.vehicles],
+        "lengths_m": scenario.lengths_m,
+        "width_m": WIDTH_M,
         "speed_unit_mps": SPEED_UNIT_MPS,
         **road_data(road),
     }

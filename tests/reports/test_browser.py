@@ -16,10 +16,11 @@ from support.handmade import write_run
 
 from merge_sumo.analysis.explanation import EXPLANATIONS, Axis, Explanation
 from merge_sumo.campaigns.recorded import RecordedCampaign, failures, spread_failures
-from merge_sumo.metrics.merge import Conflict
+from merge_sumo.metrics.merge import Conflict, Severity
 from merge_sumo.records import to_plain
 from merge_sumo.reports import report
 from merge_sumo.reports.text import changes
+from merge_sumo.scenario.scenario import DT_S
 
 EVIL = "<script>alert(1)</script><img src=x onerror=alert(2)>"
 
@@ -198,3 +199,20 @@ def test_why_a_failure_failed_is_drawn_and_said(browser, tmp_path):
         page.evaluate(f"location.hash = '#case-{passed}'")
         page.wait_for_function(f"chosen === place.get({passed})")
         assert not page.locator("#why").is_visible()
+
+
+def test_two_cars_at_contact_are_drawn_to_scale_with_outlines_the_one_behind_on_top(browser, made):
+    contacts = [o for o in made.outcomes if o.measures.severity is Severity.CONTACT]
+    with shown(browser, made.folder / report.REPORT) as page:
+        for behind, ahead in (("pov", "vut"), ("vut", "pov")):
+            case = next(o for o in contacts if (o.measures.dx_m > 0.0) == (behind == "vut"))
+            page.evaluate(f"location.hash = '#case-{case.index}'")
+            page.wait_for_function(f"chosen === place.get({case.index})")
+            page.evaluate(f"at({case.measures.t_end_s / DT_S:.0f})")
+            cars = page.locator("#road .car").evaluate_all(
+                """all => all.map((car) => [car.classList[1], car.getAttribute("width"),
+                car.getAttribute("height"), getComputedStyle(car).strokeWidth,
+                car.parentNode.getAttribute("transform").split(" ").pop()])"""
+            )
+            drawn = ["5", "1.8", "0.25px", "scale(1)"]
+            assert cars == [[ahead, *drawn], [behind, *drawn]]

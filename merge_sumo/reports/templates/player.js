@@ -124,18 +124,20 @@ function pose(path, along) { // front bumper at a lane coordinate of a path
   return { x: x0 + share * (x1 - x0), y: y0 + share * (y1 - y0), angle: Math.atan2(y0 - y1, x1 - x0) * 180 / Math.PI };
 }
 function TopView(svg) {
-  const cars = {};
-  this.cars = cars;
+  const cars = {}, lengthOf = (who) => data.lengths_m[who === "vut" ? 1 : 0];
+  let layer; // the cars, the last one on top
   this.show = (motion) => {
     this.moving = motion;
     svg.replaceChildren();
     // A lane is 3.2 m wide: what is left free between two lanes is the line between them.
     for (const lane of [data.main, data.ramp]) draw(svg, "path", { class: "lane", d: path(lane.map(([, x, y]) => [x, -y])), "stroke-width": 3.05 });
-    LANE ? drawLane() : draw(svg, "line", { class: "merge", x1: 0, x2: 0, y1: -5.4, y2: 2.4, "stroke-width": 0.25 });
+    LANE ? drawLane() : draw(svg, "line", { class: "merge", x1: 0, x2: 0, y1: -2.6, y2: 2.6, "stroke-width": 0.25 });
+    layer = draw(svg, "g");
     for (const who of vehicles) {
-      const group = draw(svg, "g");
-      draw(group, "rect", { class: who, x: -5, y: -1, width: 5, height: 2, rx: 0.6 });
-      const brake = draw(group, "rect", { class: "brake", x: -5.3, y: -1, width: 0.6, height: 2 });
+      const group = draw(layer, "g");
+      const length = lengthOf(who), side = { y: -data.width_m / 2, height: data.width_m };
+      draw(group, "rect", { class: `car ${who}`, x: -length, width: length, rx: 0.4, ...side });
+      const brake = draw(group, "rect", { class: "brake", x: -length, width: 0.5, ...side });
       cars[who] = { group, brake, label: draw(svg, "text", { "text-anchor": "middle" }) };
     }
   };
@@ -154,20 +156,31 @@ function TopView(svg) {
     const { rows, x: xs, v: vs, merge, until } = this.moving, t = Math.min(time, rows - 1), k = Math.min(Math.floor(t), Math.max(rows - 2, 0)), next = Math.min(k + 1, rows - 1);
     const mix = (values) => values[k] + (t - k) * (values[next] - values[k]); // between two rows
     const merged = merge !== null && t >= until;
-    const places = xs.map((x, who) => pose(who === VUT && !merged ? data.ramp : data.main, mix(x)));
+    const places = xs.map((x, who) => {
+      const along = mix(x), lane = who === VUT && !merged ? data.ramp : data.main;
+      const front = pose(lane, along), rear = pose(lane, along - lengthOf(vehicles[who]));
+      // Both bumpers are on the lane, as where overlaps are measured.
+      return { ...front, along, angle: Math.atan2(rear.y - front.y, front.x - rear.x) * 180 / Math.PI };
+    });
+    // The one behind lies on top: so both front bumpers are seen where two cars overlap.
+    const order = vehicles.map((_, who) => who).sort((a, b) => places[b].along - places[a].along);
+    const groups = order.map((who) => cars[vehicles[who]].group);
+    if (groups.some((group, k) => group !== layer.children[k])) layer.replaceChildren(...groups);
+    const apart = Math.min(...places.flatMap((a, who) => places.slice(who + 1).map((b) => Math.hypot(a.x - b.x, a.y - b.y))));
     const vutAbove = places[VUT].y > places[POV].y;
-    // The view follows all cars, never closer than 90 m.
+    // The view follows all cars, never closer than 60 m.
     const [low, high] = extent(places.map(({ x }) => x)), [bottom, top] = extent(places.map(({ y }) => y));
     const ratio = svg.clientHeight / (svg.clientWidth || 1) || 0.25, middle = (low + high) / 2, centre = (bottom + top) / 2;
-    const width = Math.max(high - low + 50, (1.7 * (top - bottom) + 22) / ratio, 90), height = width * ratio;
+    const width = Math.max(high - low + 50, (1.7 * (top - bottom) + 15) / ratio, 60), height = width * ratio;
     const size = Math.max(1, Math.min(width / 90, height / 22.5)); // labels fit
-    // Letters of a small picture are 11 pixels high.
-    const letters = Math.max(2.6 * size, 11 * width / (svg.clientWidth || width)), aside = 0.5 * width - 3.6 * letters;
+    const larger = clamp(apart / 10, 1, Math.min(size, 2.2)); // seen from afar, and to scale where two are near
+    // Letters are 11 to 15 pixels high.
+    const pixel = width / (svg.clientWidth || 400), letters = clamp(2.6 * size, 11 * pixel, 15 * pixel), aside = 0.5 * width - 3.6 * letters;
     svg.setAttribute("viewBox", `${middle - width / 2} ${-centre - height / 2} ${width} ${height}`);
     for (const [who, name] of vehicles.entries()) {
       const { x, y, angle } = places[who], v = vs[who], a = (v[next] - v[k]) / DT;
       const { group, brake, label } = cars[name];
-      group.setAttribute("transform", `translate(${x} ${-y}) rotate(${angle}) scale(${Math.min(size, 2.2)})`);
+      group.setAttribute("transform", `translate(${x} ${-y}) rotate(${angle}) scale(${larger})`);
       brake.setAttribute("visibility", a < -0.2 ? "visible" : "hidden");
       const up = (who === VUT) === vutAbove, named = who === VUT || who === POV;
       label.setAttribute("x", clamp(x - 2.5, middle - aside, middle + aside));
