@@ -15,7 +15,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from merge_sumo.analysis.reproduction import LevelBatches, Panel, PredictedMargins, Reproduction
+from merge_sumo.analysis.reproduction import (
+    ColumnResult,
+    LevelBatches,
+    Panel,
+    PredictedMargins,
+    Reproduction,
+)
 from merge_sumo.analysis.sampler_study import SamplerStudy
 from merge_sumo.errors import UserError
 from merge_sumo.files import check_new, write_new
@@ -304,15 +310,24 @@ def write_reproduction(result: Reproduction, folder: Path) -> Path:
 def _figures(result: Reproduction) -> Iterator[tuple[str, Figure]]:
     """Yield name and figure of every picture; the template captions each by its name."""
     for one in result.columns.values():
-        vut, level = one.column.vut, one.column.level
-        against = f"{vut} against a level-{level} POV"
-        yield f"curves-level{level}", coverage_curves(f"Coverage of {against}", one.study)
-        yield f"cases-level{level}", maps(f"Failures of {against}", one.panels, level)
-        if level == 1:
-            truth = one.panels[TRUTH]
-            failing, title = truth.points[truth.failed], f"The surrogate of gpr on {against}"
-            surface = predicted_margins(title, one.predicted(), level, failing)
-            yield f"gpr-surface-level{level}", surface
+        yield from figures_of(one)
     scale = result.scale
     title = f"design2 against all levels, {scale.batches} batches of {2 * scale.batch}"
     yield "allocation", allocation(title, result.levels)
+
+
+def figures_of(one: ColumnResult) -> Iterator[tuple[str, Figure]]:
+    """Yield name and figure of every picture of a column, its curves first.
+
+    Args:
+        one: the column with its results.
+    """
+    vut, level = one.column.vut, one.column.level
+    against = f"{vut} against a level-{level} POV"
+    yield f"curves-level{level}", coverage_curves(f"Coverage of {against}", one.study)
+    yield f"cases-level{level}", maps(f"Failures of {against}", one.panels, level)
+    if level == 1:
+        truth = one.panels[TRUTH]
+        failing, title = truth.points[truth.failed], f"The surrogate of gpr on {against}"
+        surface = predicted_margins(title, one.predicted(), level, failing)
+        yield f"gpr-surface-level{level}", surface

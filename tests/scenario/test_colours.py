@@ -22,5 +22,9 @@ def test_a_vehicle_has_its_colour_on_light_pages_and_on_paper(name, colour):
 
 def test_the_start_page_draws_the_cars_in_the_same_colours():
     drawing = (PICTURES / "scenario.svg").read_text(encoding="utf-8")
-    cars = re.findall(r'<rect [^>]*height="1[26]" rx="[34]" fill="(#[0-9a-f]{6})"', drawing)
-    assert cars == [COLOURS[name] for name in ("pov", "vut", "vut", "pov")]
+    cars = re.findall(r'<rect class="car" [^>]*fill="(#[0-9a-f]{6})"', drawing)
+    assert cars == [COLOURS[name] for name in ("pov", "vut", "pov", "vut")]
+    marks = re.findall(r'fill="([^"]*)" stroke="(#[0-9a-f]{6})" stroke-width="2"/>\n<text', drawing)
+    contact, conflict, harsh, safe = "#a63600", "#e08214", "#8856a7", "#5c6b78"
+    full, rings = [(contact, contact), (safe, safe)], [("none", conflict), ("none", harsh)]
+    assert marks == [full[0], *rings, full[1]]

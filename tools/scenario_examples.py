@@ -1,14 +1,9 @@
-"""Make the folders of scenarios/ again: `python tools/make_scenarios.py`.
-
-Plays each case in SUMO, writes it as a replay folder, and draws positions and speeds of all
-vehicles into `motion.png` next to it. Needs matplotlib.
-"""
+"""The episodes of scenarios/, which `tools/make_pictures.py` writes and draws."""
 
 from __future__ import annotations
 
-import argparse
 from dataclasses import dataclass
-from pathlib import Path
+from functools import cache
 from typing import Any
 
 from matplotlib.figure import Figure
@@ -18,12 +13,12 @@ from merge_sumo.metrics.measures import Measures
 from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.reports.pages import X_AXIS
 from merge_sumo.road.loader import centre_lines, road_for
+from merge_sumo.road.road import Road
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.scenario.case import Case
 from merge_sumo.scenario.scenario import COLOURS, DT_S, US23, Scenario
 from merge_sumo.scenario.trajectory import Trajectory
 from merge_sumo.simulation.simulator import Simulator
-from merge_sumo.sumo.replay_folder import write_replay_folder
 
 STYLES: dict[str, dict[str, Any]] = {
     "POV": {"color": COLOURS["pov"]},
@@ -32,7 +27,6 @@ STYLES: dict[str, dict[str, Any]] = {
     "car behind": {"color": COLOURS["behind"], "linestyle": ":"},
 }
 """Lines of the vehicles, in the order of their rows."""
-SCENARIOS = Path(__file__).resolve().parent.parent / "scenarios"
 
 
 @dataclass(frozen=True)
@@ -78,68 +72,70 @@ EXAMPLES = {
 }
 
 
-def play(example: Example) -> Trajectory:
+@dataclass(frozen=True)
+class Played:
+    """An example that SUMO has played.
+
+    Attributes:
+        example: the example.
+        trajectory: its motion.
+        road: its road.
+    """
+
+    example: Example
+    trajectory: Trajectory
+    road: Road
+
+    @property
+    def outcome(self) -> Outcome:
+        """The outcome of the case."""
+        measures = Measures.of(self.trajectory, centre_lines(self.road))
+        return Outcome(0, 0, self.example.case, measures)
+
+    @property
+    def title(self) -> str:
+        """Both drivers and the result in a line."""
+        case, measures = self.example.case, self.outcome.measures
+        pov = f"POV level {case.level}" + ("" if case.svo_rad is None else f" psi {case.svo_rad}")
+        dx = "" if measures.dx_m is None else f", dx {measures.dx_m:.1f} m"
+        if case.scenario.vehicles > 2:
+            dx += f" to the car {measures.nearest}" if measures.nearest != "pov" else " to the POV"
+        return f"{pov}, VUT {self.example.vut}: {measures.result.lower()}{dx}"
+
+
+@cache
+def play(name: str) -> Played:
     """Play one example in SUMO.
 
     Args:
-        example: the example.
+        name: name of the example.
     """
-    scenario = example.case.scenario
-    level = example.case.level
-    settings = CampaignSettings(vut=example.vut, levels=(level,), scenario=scenario)
+    example = EXAMPLES[name]
+    case = example.case
+    settings = CampaignSettings(vut=example.vut, levels=(case.level,), scenario=case.scenario)
     with Simulator(settings.load_plan().for_cases(1)) as ground:
-        (trajectory,) = ground.run([example.case])
-    return trajectory
+        (trajectory,) = ground.run([case])
+    return Played(example, trajectory, road_for(case.scenario))
 
 
-def draw(trajectory: Trajectory, title: str, path: Path) -> None:
-    """Draw positions and speeds of all vehicles over time.
+def motion_figure(played: Played) -> Figure:
+    """Return positions and speeds of all vehicles over time as a figure.
 
     Args:
-        trajectory: the motion.
-        title: title of the picture.
-        path: file of the picture.
+        played: the example.
     """
     figure = Figure(figsize=(9, 3.6), layout="constrained")
     left, right = figure.subplots(1, 2)
-    time_s = [step * DT_S for step in range(len(trajectory.motion))]
-    vehicles = trajectory.motion.shape[1]
+    motion = played.trajectory.motion
+    time_s = [step * DT_S for step in range(len(motion))]
     for axes, column, unit in ((left, 0, X_AXIS), (right, 1, "speed, m/s")):
         for row, (label, style) in enumerate(STYLES.items()):
-            if row < vehicles:
-                axes.plot(time_s, trajectory.motion[:, row, column], label=label, **style)
+            if row < motion.shape[1]:
+                axes.plot(time_s, motion[:, row, column], label=label, **style)
         axes.set_xlabel("time, s")
         axes.set_ylabel(unit)
         axes.grid(alpha=0.3)
     left.axhline(0.0, color="black", linewidth=0.8)
     left.legend()
-    figure.suptitle(title)
-    figure.savefig(path, dpi=110, metadata={"Software": None})
-
-
-def main() -> None:
-    """Write all examples; older ones are to be removed first."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("--out", type=Path, default=SCENARIOS)
-    out = parser.parse_args().out
-    for name, example in EXAMPLES.items():
-        case, folder = example.case, out / name
-        trajectory = play(example)
-        road = road_for(case.scenario)
-        measures = Measures.of(trajectory, centre_lines(road))
-        outcome = Outcome(0, 0, case, measures)
-        write_replay_folder(folder, road, outcome, trajectory)
-        pov = f"POV level {case.level}" + ("" if case.svo_rad is None else f" psi {case.svo_rad}")
-        dx = "" if measures.dx_m is None else f", dx {measures.dx_m:.1f} m"
-        if case.scenario.vehicles > 2:
-            dx += f" to the car {measures.nearest}" if measures.nearest != "pov" else " to the POV"
-        title = f"{pov}, VUT {example.vut}: {measures.result.lower()}{dx}"
-        draw(trajectory, title, folder / "motion.png")
-        print(
-            f"{name}: {title}; hardest braking of the VUT {measures.vut_max_brake_mps2:.1f}, "
-            f"of the POV {measures.pov_max_brake_mps2:.1f} m/s2"
-        )
-
-
-if __name__ == "__main__":
-    main()
+    figure.suptitle(played.title)
+    return figure
