@@ -56,6 +56,22 @@ TEXT_OF_THE_FIRST_SCREEN = """() => [...document.body.children]
   .filter(part => part.checkVisibility() && part.getBoundingClientRect().top < innerHeight / 2)
   .map(part => part.innerText).join("\\n")"""
 """Parts of the page that begin in the upper half, whole: where lines end depends on the fonts."""
+CLIPPED_TEXTS = """() => {
+  const inside = (text, box) => text.left >= box.left && text.right <= box.right
+    && text.top >= box.top && text.bottom <= box.bottom;
+  const clipped = [];
+  for (const text of document.querySelectorAll("text")) {
+    const own = text.getBoundingClientRect();
+    const x = own.left + own.width / 2, y = own.top + own.height / 2;
+    for (const rect of document.querySelectorAll("rect")) {
+      const box = rect.getBoundingClientRect();
+      const around = box.left < x && x < box.right && box.top < y && y < box.bottom;
+      if (around && !inside(own, box)) clipped.push(text.textContent);
+    }
+  }
+  return clipped;
+}"""
+"""Texts whose middle is in a box that they leave."""
 DESCRIPTION = "Description"
 """Name of the text in a PNG."""
 LINES_SHOWN = 20
@@ -234,6 +250,26 @@ MAKERS: dict[str, Maker] = {
     "scenarios/report.png": report_picture,
 }
 """How each picture is made, by its path in the checkout."""
+
+
+def pictures_on_pages() -> set[str]:
+    """Return the pictures that README and the site show, by their paths in the checkout."""
+    shown = set()
+    for page in (ROOT / "README.md", *ROOT.glob("docs/**/*.md")):
+        for link in re.findall(r"\]\(([^):]+\.(?:png|svg))\)", page.read_text(encoding="utf-8")):
+            shown.add((page.parent / link).resolve().relative_to(ROOT).as_posix())
+    return shown
+
+
+def clipped_texts(name: str) -> list[str]:
+    """Return the texts of a drawing that leave their box, in Chromium.
+
+    Args:
+        name: path of the drawing in the checkout.
+    """
+    with browser_page() as page:
+        page.goto((ROOT / name).as_uri())
+        return list(page.evaluate(CLIPPED_TEXTS))
 
 
 def stored_text(path: Path) -> str:
