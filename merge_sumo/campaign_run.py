@@ -10,7 +10,7 @@ from typing import Any
 from merge_sumo.analysis.cases_file import CasesFile
 from merge_sumo.analysis.comparison import Change, Comparison, compare_against
 from merge_sumo.analysis.share import SHARES
-from merge_sumo.campaigns.recorded import AGAINST, NAME_CHARACTERS, RecordedCampaign, failures
+from merge_sumo.campaigns.recorded import AGAINST, RecordedCampaign, failures
 from merge_sumo.campaigns.repeatability import SecondRun, read_second_runs, unrepeatable
 from merge_sumo.config import AnyRun
 from merge_sumo.metrics.cause import cause
@@ -23,11 +23,10 @@ from merge_sumo.metrics.summary import (
     parse_gates,
     summarise,
 )
-from merge_sumo.printable import printable
 from merge_sumo.records import to_plain
 from merge_sumo.reports.comparison_page import AGAINST_PAGE
 from merge_sumo.reports.facts import REPEATED, Fact, facts_of
-from merge_sumo.reports.text import comparison_headline, episode_lines, headline, transitions
+from merge_sumo.reports.text import comparison_summary, episode_lines, headline
 from merge_sumo.result import Result
 from merge_sumo.road.scenario_file import SUFFIX
 from merge_sumo.scenario.trajectory import End, Trajectory
@@ -198,13 +197,13 @@ class CampaignRun(Result):
         tested, *found = headline(run, self.facts)
         optional = [
             unrepeatable(self.repeats),
+            *self._against_lines(),
             tested,
             *self.summary.error_lines(),
             *found,
             *repeated,
             run.ran_again_in_words if run.settings.ran_again else None,
             *(f"note: {note}" for note in self._doubts),
-            *self._against_lines(),
             f"report: {self.report_file}",
         ]
         return [line for line in optional if line is not None]
@@ -212,12 +211,8 @@ class CampaignRun(Result):
     def _against_lines(self) -> list[str]:
         if self.against is None:
             return []
-        earlier = printable(str(self.recorded.settings.against)[:NAME_CHARACTERS])
-        return [
-            f"against {earlier}: {comparison_headline(self.against)}",
-            *transitions(self.against.version_changes[0]),
-            f"both motions in one picture: {self.folder / AGAINST_PAGE}",
-        ]
+        page = f"changes: {self.folder / AGAINST_PAGE}"
+        return [*comparison_summary(self.against), page]
 
     def remarks(self) -> list[str]:
         """Return sentences on the gates, and one where no case could be judged."""

@@ -22,8 +22,8 @@ from merge_sumo.scenario.scenario import Scenario
 from merge_sumo.scenario.trajectory import End
 from merge_sumo.simulation.povs import POLICIES
 
-TOLERANCE = 0.01
-"""Loss of margin that is not yet worse, without a unit."""
+NOTICED = 0.01
+"""Loss of margin with which a case is weaker, without a unit."""
 
 
 class Head(Record, frozen=True):
@@ -32,7 +32,7 @@ class Head(Record, frozen=True):
     Attributes:
         scenario: name of the scenario, and its values other than the defaults.
         cases: a record for each case, by the names of `outcomes.jsonl`.
-        tolerance: loss of margin that is not yet worse.
+        tolerance: loss of margin that is not yet worse; None where no loss is worse.
 
     The other attributes have the names and values of `campaign.json`.
     """
@@ -47,7 +47,7 @@ class Head(Record, frozen=True):
     net_sha256: str | None = None
     policies_sha256: dict[str, str] | None = None
     pov_files: dict[str, str] | None = None
-    tolerance: Annotated[float, Meta(ge=0.0, le=1000.0)] = TOLERANCE
+    tolerance: Annotated[float, Meta(ge=0.0, le=1000.0)] | None = None
 
 
 class CasesFile(RecordedCampaign):
@@ -58,7 +58,7 @@ class CasesFile(RecordedCampaign):
         failures = [outcome for outcome in kept.outcomes if outcome.failed]
 
     Attributes:
-        tolerance: loss of margin that is not yet worse.
+        tolerance: as in `Head`.
         accepted: reasons of failures that are accepted, by index of the case.
     """
 
@@ -135,9 +135,11 @@ class CasesFile(RecordedCampaign):
         if later.error is not None and earlier.error is None:
             return Change.BROKE
         if one.earlier.passes and one.later.passes:
-            less = short(one.earlier.margin) - short(one.later.margin) > self.tolerance
+            lost = short(one.earlier.margin) - short(one.later.margin)
             touches = later.severity == Severity.CONTACT != earlier.severity
-            return Change.WORSE if less or touches else Change.BOTH
+            if touches or (self.tolerance is not None and lost > self.tolerance):
+                return Change.WORSE
+            return Change.WEAKER if lost > NOTICED else Change.BOTH
         is_accepted = one.earlier.index in self.accepted and not later.end.is_error
         return Change.ACCEPTED if is_accepted and not one.later.passes else one.change
 

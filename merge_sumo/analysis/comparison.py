@@ -88,12 +88,14 @@ class Version:
 class Change(StrEnum):
     """The change of a case, in the order of tables.
 
-    A case passes where the VUT reaches its goal and the criterion is met. `WORSE` and `ACCEPTED`
-    are changes of cases files, `NOT_REPEATABLE` of cases that go differently when they run again.
+    A case passes where the VUT reaches its goal and the criterion is met. `WORSE`, `WEAKER` and
+    `ACCEPTED` are changes of cases files, `NOT_REPEATABLE` of cases that go differently when they
+    run again.
     """
 
     BROKE = "broke"
     WORSE = "worse but passing"
+    WEAKER = "weaker"
     ACCEPTED = "accepted"
     WITHIN_CHANCE = "within chance"
     NOT_REPEATABLE = "not repeatable"
@@ -103,7 +105,20 @@ class Change(StrEnum):
     BOTH = "pass with both"
 
 
-GOT_WORSE = (Change.BROKE, Change.WORSE)
+GROUPS = {
+    "worse": (Change.BROKE, Change.WORSE),
+    "better": (Change.FIXED,),
+    "weaker": (Change.WEAKER,),
+    "not counted": (
+        Change.ACCEPTED,
+        Change.WITHIN_CHANCE,
+        Change.NOT_REPEATABLE,
+        Change.STILL_CONTACT,
+    ),
+    "same verdict": (Change.NEITHER, Change.BOTH),
+}
+"""The changes by what they mean for the later version; a case that is worse gives exit code 1."""
+GOT_WORSE = GROUPS["worse"]
 
 
 def outcome_word(outcome: Outcome) -> str:
@@ -250,13 +265,13 @@ class VersionChange:
             found[one.change, outcome_word(one.earlier), outcome_word(one.later)] += 1
         return found
 
-    def count(self, change: Change) -> int:
-        """Return the number of cases with a change.
+    def count(self, *changes: Change) -> int:
+        """Return the number of cases with one of some changes.
 
         Args:
-            change: the change.
+            changes: the changes.
         """
-        return sum(case.change is change for case in self.cases)
+        return sum(case.change in changes for case in self.cases)
 
     def to_record(self) -> dict[str, Any]:
         """Return the changes as JSON has them, without the cases that pass with both versions."""
@@ -310,7 +325,7 @@ class Comparison(Result):
     def worse(self) -> bool:
         """Whether a case got worse, a version passes less often, or the last one tested no case."""
         for one in self.version_changes:
-            if one.passes_less or any(map(one.count, GOT_WORSE)):
+            if one.passes_less or one.count(*GOT_WORSE):
                 return True
         return not any(outcome.is_tested for outcome in self.versions[-1].outcomes)
 

@@ -13,14 +13,13 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from merge_sumo.analysis.cases_file import (
-    TOLERANCE,
     CasesFile,
     Head,
     policies_of,
     short,
     verdict_of,
 )
-from merge_sumo.analysis.comparison import GOT_WORSE, Comparison
+from merge_sumo.analysis.comparison import GOT_WORSE, Change, Comparison
 from merge_sumo.campaigns.recorded import RecordedCampaign, spread_failures
 from merge_sumo.errors import notice
 from merge_sumo.files import check_new, make_folder, write_new
@@ -31,6 +30,7 @@ from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.metrics.summary import one_per_case
 from merge_sumo.printable import printable
 from merge_sumo.records import check_toml_size, toml_value
+from merge_sumo.reports.text import change_in_words
 from merge_sumo.road.scenario_file import SUFFIX
 from merge_sumo.scenario.case import to_unit
 from merge_sumo.scenario.scenario import Scenario
@@ -40,8 +40,8 @@ MOST = 40
 """Maximum number of cases of a file where the user names none."""
 ABOUT = """\
 # `merge-sumo rerun THIS-FILE --vut SPEC` exits with 1 where a case passes no more, ends in a new
-# error, or passes with a new contact or a margin, in units of the criterion's thresholds, that is
-# less by more than the tolerance. A known failure may have in its line: accepted = "the reason"
+# error, or passes with a new contact; with `tolerance = 0.2` above the cases also where a margin
+# drops by more than 0.2. A known failure may have in its line: accepted = "the reason"
 """
 
 
@@ -58,18 +58,20 @@ def with_file(compared: Comparison, file: CasesFile, path: Path) -> Comparison:
     before = cases_toml(file, file.outcomes, path, file.settings.vut)
     text = cases_toml(file, outcomes.values(), path, now.vut)
     notes: list[str] = []
-    for old, new in zip(before.splitlines(), text.splitlines(), strict=True):
-        if old != new:
-            notes += [f"- {old.strip()}", f"+ {new.strip()}"]
     for one in version_change.cases:
         index = one.later.index
         reason = file.accepted.get(index)
         if one.change in GOT_WORSE:
             why = cause(one.later, now.motion(index))
             notes.append(f"case {index}, {one.change}: {why}")
+        elif one.change is Change.WEAKER:
+            notes.append(f"case {index}, {one.change}: {change_in_words(one)}")
         elif reason:
             result = "passes now: take the mark away" if one.later.passes else "fails, not counted"
             notes.append(f"case {index} is accepted ({reason}) and {result}")
+    for old, new in zip(before.splitlines(), text.splitlines(), strict=True):
+        if old != new:
+            notes += [f"- {old.strip()}", f"+ {new.strip()}"]
     if not any(one.is_tested for one in now.outcomes):
         notes.append(now.summary.nothing_tested)
     notes += compared.notes
@@ -167,7 +169,7 @@ def cases_toml(run: RecordedCampaign, outcomes: Iterable[Outcome], path: Path, v
         "vut": vut,
         "scenario": _scenario(run.scenario, path),
         "policies_sha256": policies_of(run, ordered),
-        "tolerance": run.tolerance if isinstance(run, CasesFile) else TOLERANCE,
+        "tolerance": run.tolerance if isinstance(run, CasesFile) else None,
     }
     lines = []
     for name in Head.__struct_fields__:

@@ -34,7 +34,7 @@ class TestCase:
         time_s: simulated time up to M.
         tag: failure, error or skipped; empty where it passed.
         kind: type of the failure or error, such as a severity.
-        message: reason of the tag.
+        message: reason of the tag, or a remark on a case that passed.
     """
 
     name: str
@@ -156,5 +156,7 @@ def _tests(version_change: VersionChange, *, every: bool = False) -> list[TestCa
             test.tag, test.kind, test.message = "failure", REGRESSION, change_in_words(one)
         elif one.change in (Change.ACCEPTED, Change.NOT_REPEATABLE):
             test.tag, test.message = "skipped", f"{one.change}: {change_in_words(one)}"
+        elif one.change is Change.WEAKER:
+            test.message = f"{one.change}: {change_in_words(one)}"
         tests.append(test)
     return tests

@@ -9,6 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 
 from merge_sumo.analysis.cases_file import short
 from merge_sumo.analysis.comparison import (
+    GROUPS,
     LISTED,
     Change,
     ComparedCase,
@@ -170,7 +171,8 @@ def change_in_words(case: ComparedCase) -> str:
         return f"{shares}, by Fisher's exact test p = {case.p_value:.2g}"
     words = [outcome_word(case.earlier), outcome_word(case.later)]
     # Equal words do not show the change: add the margins where both may pass, else the verdicts.
-    if words[0] == words[1] and case.change is not Change.BOTH:
+    is_weaker = case.change is Change.WEAKER
+    if is_weaker or (words[0] == words[1] and case.change is not Change.BOTH):
         for place, outcome in enumerate((case.earlier, case.later)):
             if outcome.margin is not None:
                 words[place] += f", margin {short(outcome.margin)}"
@@ -178,7 +180,7 @@ def change_in_words(case: ComparedCase) -> str:
 
 
 def version_change_headline(version_change: VersionChange) -> str:
-    """Return the numbers of a change of version in a sentence: cases by their change.
+    """Return the numbers of a change of version in a sentence: worse and better cases.
 
     Args:
         version_change: the change of version.
@@ -189,9 +191,10 @@ def version_change_headline(version_change: VersionChange) -> str:
         parts.append(f"{later} passes less often than {later - 1}, {by}")
     if version_change.cases:
         numbers = []
-        for change in Change:
-            if version_change.count(change) or change is Change.BROKE:
-                numbers.append(f"{version_change.count(change)} {change}")
+        for group, changes in GROUPS.items():
+            number = version_change.count(*changes)
+            if number or group in ("worse", "better"):
+                numbers.append(f"{number} {group}")
         parts.append(f"of {counted(len(version_change.cases), 'shared case')} {', '.join(numbers)}")
     else:
         parts.append("no case is shared")
@@ -199,7 +202,7 @@ def version_change_headline(version_change: VersionChange) -> str:
 
 
 def comparison_headline(compared: Comparison) -> str:
-    """Return the failures of each version, and the cases by their change, in a sentence.
+    """Return the failures of each version, and the worse and better cases, in a sentence.
 
     Args:
         compared: the comparison.
@@ -228,6 +231,33 @@ def fmc_rows(compared: Comparison) -> dict[int, list[str]]:
     return dict(sorted(rows.items()))
 
 
+def comparison_summary(compared: Comparison) -> list[str]:
+    """Return the failures of each version, and a table of the cases of each change of version.
+
+    Args:
+        compared: the comparison.
+    """
+    names = []
+    for number, version in enumerate(compared.versions, start=1):
+        names.append(f"{number}  {version.vut}, {version.folder or 'now'}")
+    width = max(map(len, names))
+    lines = []
+    for name, version in zip(names, compared.versions, strict=True):
+        lines.append(f"{name:<{width}}  {version.summary.counts}")
+        lines += version.summary.error_lines()
+        lines += [f"  {late}" for late in late_errors(version.outcomes)]
+    for version_change in compared.version_changes:
+        later = version_change.number
+        lines.append(f"from {later - 1} to {later}: {version_change_headline(version_change)}")
+        for group, changes in GROUPS.items():
+            title = group
+            for (change, before, after), number in version_change.transitions.items():
+                if change in changes:
+                    lines.append(f"  {title:<12}{number:6d}  {before} -> {after} ({change})")
+                    title = ""
+    return lines
+
+
 @lines_of.register
 def comparison_lines(compared: Comparison) -> list[str]:
     """Return the numbers of each version and each change, and the first of the cases.
@@ -235,42 +265,19 @@ def comparison_lines(compared: Comparison) -> list[str]:
     Args:
         compared: the comparison.
     """
-    text = [comparison_headline(compared)]
+    text = comparison_summary(compared)
     if compared.text is not None:
         return [*text, *compared.notes]
-    text.append(compared.source)
-    for number, version in enumerate(compared.versions, start=1):
-        summary = version.summary
-        text.append(f"{number}: {version.folder or 'now'} ({version.vut}): {summary.counts}")
-        text += summary.error_lines()
-        for late in late_errors(version.outcomes):
-            text.append(f"  {late}")
-    for level, row in fmc_rows(compared).items():
-        text.append(f"level {level_name(level)}: FMC {' -> '.join(row)}")
     for version_change in compared.version_changes:
-        later, cases = version_change.number, version_change.cases
-        if cases:
-            text.append(f"from {later - 1} to {later}: {counted(len(cases), 'case')} with both")
-        text += transitions(version_change)
         for change in CHANGES_LISTED:
-            changed = [case for case in cases if case.change is change]
+            changed = [case for case in version_change.cases if case.change is change]
             if changed:
                 text.append(f"{change}{cut(len(changed), LISTED)}:")
             for case in changed[:LISTED]:
                 text.append(f"  case {case.later.index}: {change_in_words(case)}")
-    return [*text, *compared.notes]
-
-
-def transitions(version_change: VersionChange) -> list[str]:
-    """Return a line with the number of cases for each change.
-
-    Args:
-        version_change: the change of version.
-    """
-    lines = []
-    for (change, earlier, later), number in version_change.transitions.items():
-        lines.append(f"{number:8d}  {earlier} -> {later} ({change})")
-    return lines
+    for level, row in fmc_rows(compared).items():
+        text.append(f"level {level_name(level)}: FMC {' -> '.join(row)}")
+    return [*text, compared.source, *compared.notes]
 
 
 # Truths and samplers

@@ -100,9 +100,14 @@ def test_shared_cases_are_paired_wherever_they_stand(tmp_path):
         (Change.BOTH, 0, 2),
     ]
     assert (found.broke, found.worse) == (1, True)
-    # The table of transitions stands before any list of cases.
-    lines = found.lines()
-    assert lines.index("from 1 to 2: 3 cases with both") < lines.index("broke, 1:")
+    assert found.lines()[:6] == [
+        f"1  a, {a.folder}  1 failure (0 contacts) in 3 cases",
+        f"2  b, {b.folder}  1 failure (0 contacts) in 3 cases",
+        "from 1 to 2: of 3 shared cases 1 worse, 1 better, 1 same verdict",
+        "  worse            1  safe -> safe (broke)",
+        "  better           1  safe -> safe (fixed)",
+        "  same verdict     1  safe -> safe (pass with both)",
+    ]
 
 
 def test_a_version_that_passes_less_often_than_chance_explains_is_worse(call, tmp_path):
@@ -112,10 +117,10 @@ def test_a_version_that_passes_less_often_than_chance_explains_is_worse(call, tm
     b = write(tmp_path / "b", *shared, *((x, y, "fails") for x, y in own))
     files = "--out", tmp_path / "page.html", "--junit", tmp_path / "junit.xml"
     said = call("compare", a.folder, b.folder, *files)
-    first = said.out.splitlines()[0]
-    assert first.startswith("0 failures in 16 cases -> 8 failures (0 contacts) in 16 cases; ")
-    assert "2 passes less often than 1, by Fisher's exact test p = 0.0024" in first
-    assert "of 8 shared cases 0 broke, 8 pass with both" in first
+    assert said.out.splitlines()[2] == (
+        "from 1 to 2: 2 passes less often than 1, by Fisher's exact test p = 0.0024; "
+        "of 8 shared cases 0 worse, 0 better, 8 same verdict"
+    )
     assert said.code == 1
     assert "Version 2 passes in a smaller share" in (tmp_path / "page.html").read_text()
     assert etree.parse(tmp_path / "junit.xml").getroot().get("failures") == "1"
@@ -135,7 +140,7 @@ def test_three_versions_are_two_changes(tmp_path):
     ]
     assert comparison_headline(found) == (
         "0 failures in 1 case -> 1 failure (0 contacts) in 1 case -> 0 failures in 1 case; from 1 "
-        "to 2: of 1 shared case 1 broke; from 2 to 3: of 1 shared case 0 broke, 1 fixed"
+        "to 2: of 1 shared case 1 worse, 0 better; from 2 to 3: of 1 shared case 0 worse, 1 better"
     )
     assert [row[0] for row in fmc_rows(found).values()] == ["0.0000"]
 

@@ -141,5 +141,5 @@ def test_a_case_that_passed_and_ends_with_an_error_broke(command_line):
     assert code == 0, err
     errors = sum(o.measures.end.is_error for o in RecordedCampaign(Path("run")).outcomes)
     assert 0 < errors < 10
-    assert re.search(rf"against old.py:f: .* of 10 shared cases {errors} broke", out)
+    assert re.search(rf"of 10 shared cases {errors} worse, 0 better", out)
     assert re.search(r"safe -> vut error \(broke\)", out)
