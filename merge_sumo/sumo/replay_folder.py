@@ -51,12 +51,22 @@ REAL_TIME_MS = "1000"
 """Delay of sumo-gui for each simulated second: SUMO 1.28 counts it so."""
 HOLD_STEPS = 10
 """Number of rows of a record that repeat the last one, so that the last picture stays."""
-NAMES = {"pov": "POV", "vut": "VUT", "ahead": "car ahead", "behind": "car behind"}
-"""Names of the vehicles in the legend."""
+UNIT = "unit"
+"""Last entry of the legend: sumo-gui shows the speed of a car without its unit."""
+NAMES = {
+    "pov": "POV",
+    "vut": "VUT",
+    "ahead": "car ahead",
+    "behind": "car behind",
+    UNIT: "speeds in m/s",
+}
+"""Texts of the legend."""
 TEXT = "text"
 """Parameter of a point of interest that sumo-gui shows."""
 PALE = "0.93,0.93,0.90"
 """Red, green and blue of the background, from 0 to 1."""
+ROAD_COLOUR = "0.79,0.78,0.76"
+"""Red, green and blue of lanes, as in the report."""
 INK = "0.1,0.1,0.1"
 """Red, green and blue of texts."""
 FIRST_LINE_UP = 0.465
@@ -262,8 +272,28 @@ def view_settings(view: View) -> etree._Element:
     """
     root = etree.Element("viewsettings")
     scheme = etree.SubElement(root, "scheme", name="merge")
-    etree.SubElement(scheme, "edges", laneShowBorders="1")
-    etree.SubElement(scheme, "vehicles", vehicleQuality="3", vehicle_exaggeration="1")
+    edges = etree.SubElement(
+        scheme, "edges", laneShowBorders="1", showLinkDecals="0", showLinkRules="0"
+    )
+    uniform = etree.SubElement(edges, "colorScheme", name="uniform")
+    etree.SubElement(uniform, "entry", name="road", color=ROAD_COLOUR)
+    cars = etree.SubElement(
+        scheme,
+        "vehicles",
+        vehicleQuality="3",
+        vehicle_exaggeration="1",
+        # It shows the value by which it would scale a car: that is the speed, at a scale of 1.
+        vehicleScaleMode="2",
+        vehicleScaleValue_show="1",
+        vehicleScaleValue_size="60",
+        vehicleScaleValue_color=INK,
+        vehicleScaleValue_constantSize="1",
+        vehicleScaleValue_bgColor=PALE,
+        # The speed stands this far above the car.
+        vehicleName_size="90",
+    )
+    by_speed = etree.SubElement(cars, "scalingScheme", name="by speed")
+    etree.SubElement(by_speed, "entry", threshold="0", color="1")
     etree.SubElement(
         scheme,
         "pois",
@@ -282,15 +312,16 @@ def view_settings(view: View) -> etree._Element:
 
 
 def _view_of(road: Road, record: etree._Element) -> View:
-    """Return the view of all positions of the VUT in a record."""
+    """Return the view of all positions of the VUT in a record, and of the last of the POV."""
     net = [(x, y) for path in (road.mainline, road.ramp) for _, x, y in path.corners()]
     driven = []
-    for car in record.iterfind(f"timestep/vehicle[@id='{VEHICLES[VUT]}']"):
+    of_vut = record.iterfind(f"timestep/vehicle[@id='{VEHICLES[VUT]}']")
+    for car in (*of_vut, *list(record[-1])[:2]):
         driven.append((float(car.get("x", "")), float(car.get("y", ""))))
     whole_m, _ = _box(net)
     driven_m, (x_m, y_m) = _box(driven)
-    # The way of the VUT fills 1 / 1.3 of the width, a way below 100 m less.
-    width_m = 1.3 * max(driven_m, 100.0)
+    # The way of the VUT fills the width but for a margin, a way below 100 m less.
+    width_m = 1.1 * max(driven_m, 100.0)
     return View(f"{100.0 * whole_m / width_m:.0f}", round(x_m), round(y_m), width_m)
 
 
@@ -320,6 +351,7 @@ def _config(timesteps: int) -> etree._Element:
         "gui-settings-file": VIEW,
         "start": "true",
         "delay": REAL_TIME_MS,
+        "precision": "1",  # of the speeds
         # sumo-gui halts there. At the end it would show a dialog over the last picture.
         "breakpoints": f"{end_s - 2.0 * DT_S:.1f}",
         "window-size": "1280,800",
@@ -343,10 +375,10 @@ def _labels(outcome: Outcome, trajectory: Trajectory, view: View) -> etree._Elem
         at = view.place(0.0, FIRST_LINE_UP - LINE_DOWN * number)
         _label(root, f"line{number}", at, line)
     cars = VEHICLES[: outcome.case.scenario.vehicles]
-    for number, name in enumerate(cars):
-        from_middle = number - 0.5 * (len(cars) - 1)
-        at = view.place(LEGEND_RIGHT * from_middle, LEGEND_UP)
-        _label(root, name, at, NAMES[name], COLOURS[name], DOT * view.width_m)
+    for number, name in enumerate((*cars, UNIT)):
+        at = view.place(LEGEND_RIGHT * (number - 0.5 * len(cars)), LEGEND_UP)
+        colour = COLOURS.get(name, PALE)
+        _label(root, name, at, NAMES[name], colour, DOT * view.width_m)
     return root
 
 

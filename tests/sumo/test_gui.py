@@ -119,6 +119,17 @@ def test_the_cars_meet(pictures):
     assert apart[1] < apart[0]
 
 
+def test_a_car_is_to_scale_on_a_grey_road_with_its_speed_above_it(pictures):
+    last = pictures[1]
+    car_px = car(last, "vut")
+    (top, left), (bottom, right) = car_px.min(axis=0), car_px.max(axis=0)
+    assert len(places(last, (201.0, 199.0, 194.0))) > 5000, "a road as in the report"
+    assert 2.0 < (right - left) / (bottom - top) < 3.2, "5 m and 1.8 m"
+    assert right - left >= 18
+    above = last[top - 30 : top - 8, left:right]
+    assert len(places(above, (26.0, 26.0, 26.0))) > 20, "a speed"
+
+
 def test_it_begins_before_the_conflict_and_looks_the_same_from_there_on(
     run, pictures, display, tmp_path
 ):
@@ -140,7 +151,7 @@ def test_the_window_has_the_case_its_cause_and_the_colours_of_the_report(run, pi
     assert case.startswith(f"case {outcome.index}, POV level {outcome.case.level}: x_POV0 ")
     said = cause(outcome, run.trajectory(outcome.index))
     assert f"{head} {course}. {way_out}." == said
-    assert legend == ["POV", "VUT"]
+    assert legend == ["POV", "VUT", "speeds in m/s"]
     for image in pictures:
         top = image[: round(LABELS_SHARE * image.shape[0])]
         assert len(places(top, (26.0, 26.0, 26.0))) > 100, "a text"
