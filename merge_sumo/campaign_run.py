@@ -24,9 +24,10 @@ from merge_sumo.metrics.summary import (
     summarise,
 )
 from merge_sumo.records import to_plain
+from merge_sumo.reports.campaign_table import campaign_lines, labelled
 from merge_sumo.reports.comparison_page import AGAINST_PAGE
-from merge_sumo.reports.facts import REPEATED, Fact, facts_of
-from merge_sumo.reports.text import comparison_summary, episode_lines, headline
+from merge_sumo.reports.facts import Fact, facts_of
+from merge_sumo.reports.text import comparison_summary, episode_lines
 from merge_sumo.result import Result
 from merge_sumo.road.scenario_file import SUFFIX
 from merge_sumo.scenario.trajectory import End, Trajectory
@@ -187,32 +188,22 @@ class CampaignRun(Result):
         }
 
     def lines(self) -> list[str]:
-        """Return the headline, remarks, and the path of the report."""
-        run = self.recorded
-        repeated = [
-            f"{fact.name}: {fact.shown}"
-            for fact in self.facts
-            if fact.level is None and fact.name == REPEATED
-        ]
-        tested, *found = headline(run, self.facts)
-        optional = [
-            unrepeatable(self.repeats),
+        """Return the table of POV levels, remarks, and the path of the report."""
+        run, warning = self.recorded, unrepeatable(self.repeats)
+        notes = [run.ran_again_in_words] if run.settings.ran_again else []
+        return [
+            *([] if warning is None else [warning]),
             *self._against_lines(),
-            tested,
-            *self.summary.error_lines(),
-            *found,
-            *repeated,
-            run.ran_again_in_words if run.settings.ran_again else None,
-            *(f"note: {note}" for note in self._doubts),
-            f"report: {self.report_file}",
+            *campaign_lines(run, self.summary, self.facts),
+            *labelled("Note:", [*notes, *self._doubts]),
+            *labelled("Report:", [str(self.report_file)]),
         ]
-        return [line for line in optional if line is not None]
 
     def _against_lines(self) -> list[str]:
         if self.against is None:
             return []
         page = f"changes: {self.folder / AGAINST_PAGE}"
-        return [*comparison_summary(self.against), page]
+        return [*comparison_summary(self.against), page, ""]
 
     def remarks(self) -> list[str]:
         """Return sentences on the gates, and one where no case could be judged."""

@@ -69,12 +69,13 @@ class LevelShare(Record, frozen=True):
         """The share and its interval in percent."""
         low, high = map(_percent, self.interval)
         if not self.failures:
-            return f"less than {high} %"
-        return f"{_percent(self.failures / self.cases)} % [{low}, {high}]"
+            return f"< {high} %"
+        return f"{_percent(self.failures / self.cases)} %  ({low} to {high})"
 
 
 def _percent(share: float) -> str:
-    return f"{100.0 * share:.{3 if share >= 0.1 else 2}g}"
+    digits = 1 if share < 0.001 else 2 if share < 0.1 else 3
+    return f"{100.0 * share:.{digits}g}"
 
 
 class Shares(Record, frozen=True):

@@ -137,14 +137,14 @@ class Criterion:
         return self.require is None and "score" in condition_of(self.condition).names
 
     def description(self, scenario: Scenario) -> str:
-        """Return when a case of a scenario fails, as a clause for a user.
+        """Return what makes a case of a scenario fail, to stand behind "fails with".
 
         Args:
             scenario: the scenario.
         """
         if self.is_of_paper:
             limit = f"{scenario.dx_crash_m:g} m"
-            return f"front bumpers are within {limit} when the VUT reaches {scenario.goal}"
+            return f"front bumpers within {limit} when the VUT reaches {scenario.goal}"
         return self.condition
 
     @property

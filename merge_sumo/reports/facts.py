@@ -33,13 +33,14 @@ PERCENT = "%"
 
 # Names of facts that the terminal and the templates look up.
 VUT = "VUT"
-RULE = "a case fails when"
+RULE = "a case fails with"
 CASES = "cases"
 AT_MOST = "cases at most; the search converged before"
 ERRORS = "errors"
 TIMEOUTS = "timeouts"
 FAILURES = "failures"
 UNDECIDED = "undecided"
+WITHOUT_VERDICT = "without a verdict"
 CONTACT = "cases with contact that are not failures"
 REGIONS = "regions"
 FMC = "FMC"
@@ -180,7 +181,7 @@ def _of_level(run: RecordedCampaign, level: int, summary: LevelSummary, failing:
     fact = partial(Fact, level=level)
     yield fact(CASES, summary.cases, "level")
     if summary.tested < summary.cases:
-        yield fact("without a verdict", summary.cases - summary.tested, "end")
+        yield fact(WITHOUT_VERDICT, summary.cases - summary.tested, "end")
     if summary.tested or not summary.cases:
         yield fact(FAILURES, summary.failures, failing)
         if run.tolerated:

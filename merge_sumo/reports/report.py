@@ -31,12 +31,13 @@ from merge_sumo.metrics.fmc import radius_for
 from merge_sumo.metrics.merge import meanings
 from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.metrics.plausibility import doubts
+from merge_sumo.reports.campaign_table import campaign_lines
 from merge_sumo.reports.comparison_page import AGAINST_PAGE, write_against
 from merge_sumo.reports.facts import ERRORS, FAILURES, STARTS_THAT_FAIL, TIMEOUTS, by_level
 from merge_sumo.reports.pages import page
 from merge_sumo.reports.report_data import page_data, pairs_of
 from merge_sumo.reports.report_model import INDEX, ReportModel
-from merge_sumo.reports.text import comparison_headline, headline, robustness
+from merge_sumo.reports.text import comparison_headline, robustness
 
 REPORT = "report.html"
 FIRST_REPORT_S = 2.0
@@ -99,7 +100,7 @@ def report_page(model: ReportModel, *, running: bool = False) -> str:
         go_on=campaign_command("resume", run.folder, run.record),
         printed=end_of(run.folder / LOG),
         levels=by_level(model.facts),
-        headline=headline(run, model.facts),
+        headline=campaign_lines(run, model.summary, model.facts),
         kinds=Counter(model.kinds.values()).most_common(),
         # Constants of the sections.
         starts_that_fail=STARTS_THAT_FAIL,

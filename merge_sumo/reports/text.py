@@ -1,11 +1,12 @@
 """Write results as sentences and lines for a terminal: begin at the functions of `lines_of`.
 
-Each writes one type of result. `headline`, `causes` and `episode_lines` write campaigns and cases.
+Each writes one type of result. `causes` and `episode_lines` write cases; `campaign_table.py`
+writes campaigns.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 
 from merge_sumo.analysis.cases_file import short
 from merge_sumo.analysis.comparison import (
@@ -25,9 +26,8 @@ from merge_sumo.analysis.sampler_study import SamplerStudy, Spread
 from merge_sumo.analysis.stress import StressResult
 from merge_sumo.analysis.truth import DENSE_CASES, REAL_REGION, Truth, TruthResult
 from merge_sumo.analysis.vut_check import VutCheck
-from merge_sumo.campaigns.printed_commands import campaign_command, command
+from merge_sumo.campaigns.printed_commands import command
 from merge_sumo.campaigns.recorded import RecordedCampaign
-from merge_sumo.drivers.reference_drivers import REFERENCE_DRIVERS
 from merge_sumo.metrics.cause import cause, conflicting_car
 from merge_sumo.metrics.fmc import fmc
 from merge_sumo.metrics.measures import recorded_measures
@@ -35,27 +35,6 @@ from merge_sumo.metrics.merge import Conflict
 from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.metrics.plausibility import late_errors
 from merge_sumo.printable import counted, either, printable
-from merge_sumo.reports.facts import (
-    AT_MOST,
-    AVOIDED,
-    AVOIDED_BY_POV,
-    CASES,
-    CONTACT,
-    DRIVEN,
-    FAILURES,
-    FMC,
-    KIND,
-    PROBABILITY_TO_FAIL,
-    REGIONS,
-    RULE,
-    STARTS,
-    STARTS_THAT_FAIL,
-    UNDECIDED,
-    VUT,
-    WORST,
-    Fact,
-    by_level,
-)
 from merge_sumo.result import lines_of
 from merge_sumo.scenario.case import Case, coordinates, described
 from merge_sumo.scenario.scenario import DT_S, VEHICLES, level_name
@@ -92,69 +71,6 @@ def cut(number: int, most: int) -> str:
         most: maximum number of items that are shown.
     """
     return f", the first {most} of {number}" if number > most else f", {number}"
-
-
-# Campaigns
-
-
-def headline(run: RecordedCampaign, facts: Sequence[Fact]) -> list[str]:
-    """Return the first lines on a campaign, as the terminal and the report begin.
-
-    Args:
-        run: the campaign.
-        facts: its facts, as `facts_of` returns them; the lines have no other numbers.
-    """
-    of = {fact.name: fact for fact in facts if fact.level is None}
-    levels = by_level(facts)
-    cases = _counted(of[CASES], "case")
-    if AT_MOST in of:
-        cases = f"{of[CASES].shown} of {of[AT_MOST].shown} cases, converged"
-    lines = [f"{of[VUT].shown}: {RULE} {of[RULE].shown}; {cases}"]
-    for line in aligned([_level_cells(level, row) for level, row in levels.items()]):
-        lines.append(f"  {line}")
-
-    if CONTACT in of:
-        contacts = _counted(of[CONTACT], "more case")
-        lines.append(f"contact after the merge in {contacts}: `fail_when` unsafe counts them")
-    has_shares = any(STARTS_THAT_FAIL in row for row in levels.values())
-    if not has_shares and PROBABILITY_TO_FAIL not in of:
-        measure = campaign_command("probability", run.folder, run.record)
-        lines.append(f"{STARTS_THAT_FAIL} are not measured: {measure}")
-    if AVOIDED_BY_POV in of:
-        lines.append(_avoided(of))
-    if WORST in of:
-        replay = command("replay", run.folder, of[WORST].value, gui=True)
-        lines.append(f"{WORST} ({of[KIND].shown}): {replay}")
-    return lines
-
-
-def _counted(fact: Fact, what: str) -> str:
-    return f"{fact.shown} {what}" if fact.value == 1 else f"{fact.shown} {what}s"
-
-
-def _avoided(of: Mapping[str, Fact]) -> str:
-    """Return how many failures each reference driver, and a careful POV, would have avoided."""
-    number = _counted(of[FAILURES], "failure")
-    if DRIVEN in of:
-        number = f"{of[DRIVEN].shown} of {number}"
-    drivers = [f"{name} {of[AVOIDED.format(name)].shown}" for name in REFERENCE_DRIVERS]
-    pov = f"by a careful POV {of[AVOIDED_BY_POV].shown}"
-    return f"avoided of {number}: by driver {', '.join(drivers)}, {pov}"
-
-
-def _level_cells(level: int, of: Mapping[str, Fact]) -> list[str]:
-    """Return level, share of starts, failures, regions and FMC as text; "" for none."""
-    share, failures, regions, coverage = "", "nothing tested", "", ""
-    if STARTS_THAT_FAIL in of:
-        share = f"{of[STARTS_THAT_FAIL].shown} of all starts fail, by {of[STARTS].shown}"
-    if FAILURES in of:
-        failures = f"{_counted(of[FAILURES], 'failure')} found"
-        if UNDECIDED in of and of[UNDECIDED].value:
-            failures += f", {of[UNDECIDED].shown} undecided"
-        if of[FMC].value:
-            regions = _counted(of[REGIONS], "region")
-            coverage = f"FMC {of[FMC].shown}"
-    return [f"level {level_name(level)}", share, failures, regions, coverage]
 
 
 # Comparisons
@@ -314,7 +230,7 @@ def truth_lines(found: TruthResult) -> list[str]:
         lines.append(line)
         if truth.is_small:
             lines.append(f"  {_too_small(truth)}")
-    return [*lines, f"  a case fails when {found.criterion.description(found.scenario)}"]
+    return [*lines, f"  a case fails with {found.criterion.description(found.scenario)}"]
 
 
 def _spread(spread: Spread, form: str) -> str:

@@ -18,10 +18,12 @@ from merge_sumo.simulation.evaluate import simulate_part
     ("failures", "says"),
     [
         # 1 - .05 ** (1 / 2000), one-sided
-        (0, "less than 0.15 %"),
+        (0, "< 0.15 %"),
         # The quantiles of beta(38, 1963) and beta(39, 1962).
-        (38, "1.9 % [1.3, 2.6]"),
-        (2000, "100 % [99.8, 100]"),
+        (38, "1.9 %  (1.3 to 2.6)"),
+        # The quantiles of beta(1, 2000) and beta(2, 1999), with one digit below 0.1 %.
+        (1, "0.05 %  (0.001 to 0.28)"),
+        (2000, "100 %  (99.8 to 100)"),
     ],
 )
 def test_is_said_with_its_exact_interval(failures, says):
@@ -38,7 +40,7 @@ def test_of_a_campaign_holds_the_share_of_many_more_starts(tmp_path, monkeypatch
     # .0229 of the pool fail: a truth of 1,000,000 uniform cases.
     assert low < 0.0229 < high
     assert (level.cases, level.failures > 0) == (2000, True)
-    assert f"  {level.shown} of all starts fail, by 2,000  " in str(run)
+    assert f"\n0           {level.shown}  " in str(run)
 
 
 OWN = """
@@ -77,8 +79,7 @@ def test_of_a_controller_of_the_user_is_measured_too():
         ends = simulate_part(plan.for_verdicts(), cases, end_of)
         assert one.failures == sum(failed for failed, _, _ in ends)
         assert one.failures or level == 1
-        said = f"  {one.shown} of all starts fail, by {one.cases:,}  "
-        assert said in str(run)
+        assert f"\n{level}           {one.shown}  " in str(run)
 
 
 @pytest.mark.usefixtures("own")
@@ -91,7 +92,7 @@ def test_of_a_controller_that_errs_says_so_or_is_not_measured():
     run = api.campaign("own.py:Broken", level=0, seed=4, cases=4, out="broken", progress=False)
     assert SHARES.read(run.folder) is None
     command = "merge-sumo probability broken --vut own.py:Broken"
-    assert f"not measured: {command}" in str(run)
+    assert f"is measured by\n             {command}" in str(run)
 
 
 def test_of_a_campaign_of_uniform_cases_is_that_of_its_own_cases(tmp_path):
@@ -101,9 +102,8 @@ def test_of_a_campaign_of_uniform_cases_is_that_of_its_own_cases(tmp_path):
     failures = sum(outcome.failed for outcome in run.recorded.outcomes)
     [level] = SHARES.read(run.folder).levels
     assert level == LevelShare(level=0, cases=10, failures=failures)
-    said = f"  {level.shown} of all starts fail, by 10  "
-    assert said in str(run)
-    assert "not measured" not in str(run)
+    assert f"\n0           {level.shown}  " in str(run)
+    assert "is measured by" not in str(run)
 
 
 class Parked:
@@ -119,7 +119,7 @@ def test_no_share_or_probability_is_stated_of_a_vut_that_never_merges(tmp_path, 
     [level] = SHARES.read(run.folder).levels
     assert level.failures == 0
     assert level.without_verdict == level.cases
-    assert "of all starts fail" not in str(run)
+    assert "POV level   failures found" in str(run), "and no share"
     found = api.probability(run, vut=Parked, cases=20)
     assert found.lines() == [
         "P(fail) is not known: no case was judged, the VUT never reached the merge point"

@@ -64,7 +64,8 @@ def test_without_a_number_of_cases_a_campaign_ends_when_it_has_converged_and_may
     run = api.campaign("design1", **plan, out=tmp_path / "run")
     assert run.converged
     assert 20 < len(run.recorded.outcomes) < 800
-    assert run.lines()[0].endswith(f"; {len(run.recorded.outcomes)} of 800 cases, converged")
+    assert f": {len(run.recorded.outcomes)} cases, " in run.lines()[0]
+    assert "Converged:   before 800 cases, as little new was found" in run.lines()
     more = api.resume(run, cases=len(run.recorded.outcomes) + 40, progress=False)
     assert not more.converged
     assert more.recorded.outcomes[:-40] == run.recorded.outcomes

@@ -16,11 +16,9 @@ from support.handmade import write_run
 from merge_sumo.analysis.counterfactuals import AVOIDANCE, Avoidance
 from merge_sumo.campaign_run import CampaignRun
 from merge_sumo.campaigns.recorded import RecordedCampaign, failures
-from merge_sumo.reports import report_model
-from merge_sumo.reports.facts import CONTACT, Fact
+from merge_sumo.reports.facts import Fact
 from merge_sumo.reports.report import report_page
 from merge_sumo.reports.report_model import ReportModel
-from merge_sumo.reports.text import headline
 
 
 @pytest.fixture(scope="module")
@@ -90,25 +88,3 @@ def test_are_all_in_the_report_and_in_its_json(made, facts, page):
     said = json.loads(invoke("report", made.folder, "--json").stdout)
     assert Path(said["report"]).is_file()
     assert [Fact(**row) for row in said["facts"]] == list(facts.values())
-
-
-def test_of_the_headline_begin_terminal_and_report(made, page):
-    lines = headline(made, CampaignRun(made).facts)
-    printed = CampaignRun(made).lines()
-    assert [line for line in printed if line in lines] == lines
-    assert printed[1:3] == [
-        "  1 VUT_ERROR, the first in case 3: boom",
-        "  2 TIMEOUT, the first in case 4: the VUT did not reach the merge point in 12 s",
-    ]
-    assert printed[-1] == f"report: {made.folder / 'report.html'}"
-    (card,) = page.xpath("//section[@aria-labelledby='headline']//pre")
-    assert card.text == "\n".join(lines).replace("`", "")
-
-
-def test_of_the_headline_name_the_option_of_another_rule_in_the_report(made, monkeypatch):
-    facts = [*CampaignRun(made).facts, Fact(CONTACT, 2, "severity")]
-    monkeypatch.setattr(report_model, "facts_of", lambda *_: facts)
-    page: Any = html.fromstring(report_page(ReportModel(made, learns=False)))
-    (card,) = page.xpath("//section[@aria-labelledby='headline']//pre")
-    said = "contact after the merge in 2 more cases: --fail-when unsafe counts them"
-    assert said in card.text

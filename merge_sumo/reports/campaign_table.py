@@ -1,0 +1,187 @@
+"""The end of a campaign in a terminal: a line on all, a table of POV levels, and what follows."""
+
+from __future__ import annotations
+
+import textwrap
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+
+from merge_sumo.campaigns.printed_commands import campaign_command, command
+from merge_sumo.campaigns.recorded import RecordedCampaign
+from merge_sumo.drivers.reference_drivers import REFERENCE_DRIVERS
+from merge_sumo.metrics.summary import Summary
+from merge_sumo.reports.facts import (
+    AT_MOST,
+    AVOIDED,
+    AVOIDED_BY_POV,
+    CASES,
+    CONTACT,
+    DRIVEN,
+    ERRORS,
+    FAILURES,
+    FMC,
+    KIND,
+    PROBABILITY_TO_FAIL,
+    REGIONS,
+    REPEATED,
+    RULE,
+    STARTS_THAT_FAIL,
+    TIMEOUTS,
+    UNDECIDED,
+    VUT,
+    WITHOUT_VERDICT,
+    WORST,
+    Fact,
+    by_level,
+)
+from merge_sumo.scenario.scenario import level_name
+
+LINE_CHARACTERS = 105
+"""Longest first line with the rule; the rule of a longer one is a line of its own."""
+LABEL_CHARACTERS = 13
+TEXT_CHARACTERS = 100 - LABEL_CHARACTERS
+COLUMNS = (
+    "POV level",
+    "all starts that fail   ",  # as wide as the widest usual cell
+    "failures found",
+    "undecided",
+    "no verdict",
+    "regions",
+    "FMC",
+)
+LEFT = COLUMNS[:2]
+"""Left-aligned columns."""
+SMALL_FMC = 0.001
+
+
+def campaign_lines(run: RecordedCampaign, summary: Summary, facts: Sequence[Fact]) -> list[str]:
+    """Return the first line, the table, and the remarks on a campaign.
+
+    Args:
+        run: the campaign.
+        summary: its summary.
+        facts: its facts, as `facts_of` returns them.
+
+    Example:
+        >>> campaign_lines(run, summary, facts)[0]
+        'design2 on us23: 480 cases, 180 failures (front bumpers within 6 m when the VUT ...'
+    """
+    of = {fact.name: fact for fact in facts if fact.level is None}
+    things = {CASES: "case", ERRORS: "error", TIMEOUTS: "timeout"}
+    if summary.tested:
+        things[FAILURES] = "failure"
+    found = []
+    for name, thing in things.items():
+        if name in of:
+            found.append(_counted(of[name], thing))
+    if not summary.tested:
+        found.append("nothing tested")
+    if summary.undecided:
+        found.append(f"{of[UNDECIDED].shown} undecided")
+    head = f"{of[VUT].shown} on {run.scenario.name}: {', '.join(found)}"
+    rule = f"({of[RULE].shown})"
+    between = " " if len(head) + len(rule) < LINE_CHARACTERS else "\n"
+    lines = [*f"{head}{between}{rule}".split("\n"), ""]
+    table = level_table(facts)
+    if len(table) > 1:
+        lines += [*_table_lines(table), ""]
+    of_levels = {fact.name for fact in facts if fact.level is not None}
+    for label, remarks in _remarks(run, summary, of, STARTS_THAT_FAIL in of_levels):
+        lines += labelled(label, remarks)
+    return lines
+
+
+def labelled(label: str, lines: Iterable[str]) -> Iterator[str]:
+    """Yield lines, the first of them with a label.
+
+    Args:
+        label: the label, up to its colon.
+        lines: the lines.
+    """
+    for line in lines:
+        yield f"{label:<{LABEL_CHARACTERS}}{line}"
+        label = ""
+
+
+def level_table(facts: Iterable[Fact]) -> list[list[str]]:
+    """Return the table of POV levels: a head, and a row for each level; no empty column.
+
+    Args:
+        facts: facts of a campaign.
+    """
+    rows = [list(COLUMNS)]
+    for level, of in by_level(facts).items():
+        rows.append(_level_cells(level, of))
+    columns = [column for column in zip(*rows, strict=True) if any(column[1:])]
+    return [list(row) for row in zip(*columns, strict=True)]
+
+
+def _level_cells(level: int, of: Mapping[str, Fact]) -> list[str]:
+    """Return the cells of a level by column; "" for none."""
+    cells = [level_name(level), of[STARTS_THAT_FAIL].shown if STARTS_THAT_FAIL in of else ""]
+    if not of[CASES].value:
+        return [*cells, "not run", "", "", "", ""]
+    cells.append(of[FAILURES].shown if FAILURES in of else "nothing tested")
+    for name in (UNDECIDED, WITHOUT_VERDICT, REGIONS):
+        cells.append(of[name].shown if name in of and of[name].value else "")
+    coverage = float(of[FMC].value) if FMC in of else 0.0
+    shown = f"{coverage:.3f}".removeprefix("0") if coverage >= SMALL_FMC else "< .001"
+    return [*cells, shown if coverage else ""]
+
+
+def _table_lines(rows: Sequence[Sequence[str]]) -> list[str]:
+    """Return the lines of a table; numbers are right-aligned."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    lines = []
+    for row in rows:
+        cells = []
+        for name, cell, width in zip(rows[0], row, widths, strict=True):
+            cells.append(cell.ljust(width) if name in LEFT else cell.rjust(width))
+        lines.append("   ".join(cells).rstrip())
+    return lines
+
+
+def _remarks(
+    run: RecordedCampaign, summary: Summary, of: Mapping[str, Fact], has_shares: bool
+) -> Iterator[tuple[str, list[str]]]:
+    """Yield labels, and the lines behind each."""
+    yield "Not judged:", [line.strip() for line in summary.error_lines()]
+    if CONTACT in of:
+        contacts = f"{_counted(of[CONTACT], 'case')} with contact after the merge point"
+        yield "Not counted:", [f"{contacts} (`fail_when` unsafe counts them)"]
+    if not has_shares and PROBABILITY_TO_FAIL not in of:
+        measure = campaign_command("probability", run.folder, run.record)
+        yield "Not known:", ["the share of all starts that fail, which is measured by", measure]
+    if REPEATED in of:
+        yield "Repeated:", [f"{_counted(of[REPEATED], 'case')} ran more than once"]
+    if AT_MOST in of:
+        yield "Converged:", [f"before {of[AT_MOST].shown} cases, as little new was found"]
+    if AVOIDED_BY_POV in of:
+        yield "Avoidable:", textwrap.wrap(_avoidable(of), TEXT_CHARACTERS)
+    if WORST in of:
+        replay = command("replay", run.folder, of[WORST].value, gui=True)
+        yield "Worst:", [f"case {of[WORST].value}, {of[KIND].shown}", replay]
+
+
+def _counted(fact: Fact, thing: str) -> str:
+    return f"{fact.shown} {thing}" if fact.value == 1 else f"{fact.shown} {thing}s"
+
+
+def _avoidable(of: Mapping[str, Fact]) -> str:
+    """Return how many failures the reference drivers, and a careful POV, would have avoided."""
+    driven = of[DRIVEN if DRIVEN in of else FAILURES]
+    drivers: defaultdict[float | str, list[str]] = defaultdict(list)
+    for name in REFERENCE_DRIVERS:
+        drivers[of[AVOIDED.format(name)].value].append(name)
+    parts = []
+    for number in sorted(drivers, key=float, reverse=True):
+        parts.append(f"{_times(number, driven)} by {', '.join(drivers[number])}")
+    parts.append(f"{_times(of[AVOIDED_BY_POV].value, driven)} by a careful POV")
+    text = "; ".join(parts)
+    return f"of {driven.shown} that were driven again: {text}" if DRIVEN in of else text
+
+
+def _times(number: float | str, whole: Fact) -> str:
+    if not number:
+        return "none"
+    return f"all {number:,}" if number == whole.value and number != 1 else f"{number:,}"
