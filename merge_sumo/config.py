@@ -468,7 +468,8 @@ class Rerun(Page, Levels, StudyOptions):
 
     Exit code 1 when a case broke: it passed, and does not pass now. A cases file of `export` may
     stand in the place of the campaign. Then what changed in the file is shown, `out` is the file as
-    it is now, and the exit code is 1 also for a new error or contact, or too little margin.
+    it is now, and the exit code is 1 also for a new error or contact, and for a margin that drops
+    by more than the `tolerance` of a file that has one.
 
     With a controller that others wrote, a case that changed runs a second time. Where that does not
     repeat, the case is "not repeatable", and is not counted by itself.

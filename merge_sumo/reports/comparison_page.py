@@ -1,38 +1,44 @@
-"""The page of a comparison: changes, and both motions of each case, in one file without scripts."""
+"""The page of a comparison: failures, changes, and a list of cases beside one player, in a file."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from merge_sumo.analysis.comparison import Change, Comparison, VersionChange
+from merge_sumo.analysis.comparison import (
+    GROUPS,
+    Change,
+    ComparedCase,
+    Comparison,
+    VersionChange,
+)
+from merge_sumo.campaigns.printed_commands import command
 from merge_sumo.campaigns.recorded import AGAINST
 from merge_sumo.files import GENERATOR, replace_own
 from merge_sumo.metrics.cause import cause
-from merge_sumo.reports.pages import X_AXIS, page
+from merge_sumo.reports.pages import page
+from merge_sumo.reports.report_data import motion_row, packed, player_data
 from merge_sumo.reports.text import change_in_words, comparison_headline, fmc_rows
-from merge_sumo.scenario.case import FloatArray, coordinates
-from merge_sumo.scenario.scenario import VEHICLES, VUT
+from merge_sumo.road.loader import road_or_shipped
+from merge_sumo.scenario.case import coordinates, described
+from merge_sumo.scenario.scenario import level_name
 
-SHOWN = 200
-"""Maximum number of cases of a change of version that are drawn, in the order of tables."""
-DRAWN = (
+SHOWN = 2000
+"""Maximum number of cases of a page that are listed, with both motions."""
+LISTED = (
     Change.BROKE,
+    Change.FIXED,
     Change.WITHIN_CHANCE,
     Change.NOT_REPEATABLE,
-    Change.NEITHER,
     Change.STILL_CONTACT,
-    Change.FIXED,
+    Change.NEITHER,
 )
-"""Changes that have a section with both motions of each case; the template explains them."""
+"""Changes whose cases are listed; the template explains them."""
 PAGE = ".html"
 """Ending of a page; a browser shows a file with another ending as source."""
 AGAINST_PAGE = f"{AGAINST}{PAGE}"
 """Page in the folder of a campaign against an earlier version."""
-STYLES = ("report.css", "comparison.css")
 
 
 def write_against(folder: Path, compared: Comparison) -> None:
@@ -55,72 +61,69 @@ def comparison_page(compared: Comparison) -> str:
     Args:
         compared: the comparison.
     """
-    rows = [(one, _maps(one), _sections(one, compared)) for one in compared.version_changes]
-    outcomes = [version.outcomes[0] for version in compared.versions if version.outcomes]
+    shown: list[tuple[VersionChange, ComparedCase]] = []
+    lists = []
+    for version_change in compared.version_changes:
+        for change in LISTED:
+            cases = [one for one in version_change.cases if one.change is change]
+            first, cases_shown = len(shown), cases[: SHOWN - len(shown)]
+            shown += [(version_change, one) for one in cases_shown]
+            if cases:
+                rows = list(enumerate(cases_shown, start=first))
+                lists.append((version_change, change, len(cases), rows))
     return page(
         "comparison.html.jinja",
-        styles=STYLES,
+        styles=("report.css", "comparison.css"),
+        scripts=("player.js", "comparison.js") if shown else (),
         compared=compared,
+        groups=GROUPS,
         headline=comparison_headline(compared),
         fmc=fmc_rows(compared),
         change_in_words=change_in_words,
-        version_changes=rows,
-        vehicles=outcomes[0].case.scenario.vehicles,
+        lists=lists,
+        maps=_maps(shown),
+        data=_data(compared, shown) if shown else None,
     )
 
 
-def _maps(version_change: VersionChange) -> dict[int, Any]:
-    """Return by level its coordinates, and where cases changed; those that broke lie on top."""
-    maps: dict[int, Any] = {}
-    for one in reversed(version_change.cases):
-        if one.change in DRAWN:
-            case = one.earlier.case
-            axes = coordinates(case.scenario, (case.level,))
-            maps.setdefault(case.level, (axes, []))[1].append((one.change, case))
+def _maps(shown: Sequence[tuple[VersionChange, ComparedCase]]) -> dict[tuple[int, int], Any]:
+    """Return by version and level the coordinates, and the marks, the first ones on top."""
+    maps: dict[tuple[int, int], Any] = {}
+    for number, (version_change, one) in reversed(list(enumerate(shown))):
+        case = one.earlier.case
+        axes = coordinates(case.scenario, (case.level,))
+        found = maps.setdefault((version_change.number, case.level), (axes, []))
+        found[1].append((one.change, case, number))
     return dict(sorted(maps.items()))
 
 
-def _sections(version_change: VersionChange, compared: Comparison) -> list[tuple[Change, int, Any]]:
-    """Return a section for each change: the change, its number of cases, a row for each case shown.
-
-    A row has the case, its versions (number, folder, outcome, cause), and the charts.
-    """
-    sections, left = [], SHOWN
-    for change in DRAWN:
-        cases = [case for case in version_change.cases if case.change is change]
-        shown = cases[:left]
-        left -= len(shown)
-        rows = []
-        for one in shown:
-            versions, motions = [], {}
-            for name, number in (
-                ("earlier", version_change.number - 1),
-                ("later", version_change.number),
-            ):
-                outcome, version = getattr(one, name), compared.versions[number - 1]
-                motion = version.motion(outcome.index)
-                versions.append((number, version.folder, outcome, cause(outcome, motion)))
-                if motion is not None:
-                    motions[name] = motion.whole
-            rows.append((one, versions, _charts(motions)))
-        if cases:
-            sections.append((change, len(cases), rows))
-    return sections
-
-
-def _charts(motions: Mapping[str, FloatArray]) -> list[dict[str, Any]]:
-    """Return speeds and positions of all cars in both motions, over the same axes."""
-    charts = []
-    for title, k in (("speed, m/s", 1), (X_AXIS, 0)) if motions else ():
-        lines = []
-        # The VUT lies on top.
-        for car in sorted(range(next(iter(motions.values())).shape[1]), key=lambda car: car == VUT):
-            for name, motion in motions.items():
-                values = np.round(motion[:, car, k], 2).tolist()
-                lines.append((f"{VEHICLES[car]} {name}", values))
-        drawn = np.concatenate([motion[:, :, k].ravel() for motion in motions.values()])
-        low, high = (round(float(end), 2) for end in (drawn.min(), drawn.max()))
-        steps = max(map(len, motions.values())) - 1
-        chart = {"title": title, "low": low, "high": max(high, low + 1.0), "lines": lines}
-        charts.append(chart | {"steps": max(1, steps)})
-    return charts
+def _data(
+    compared: Comparison, shown: Sequence[tuple[VersionChange, ComparedCase]]
+) -> dict[str, Any]:
+    """Return what the scripts draw: for each case shown both motions, and words on each."""
+    scenario = shown[0][1].later.case.scenario
+    pairs, motions = [], {}
+    cases: dict[str, list[Any]] = {}
+    for version_change, one in shown:
+        later, sides = version_change.number, []
+        for number, outcome in ((later - 1, one.earlier), (later, one.later)):
+            version, place = compared.versions[number - 1], len(cases.get("index", ()))
+            motion = version.motion(outcome.index)
+            if motion is not None:
+                motions[place] = motion
+            for name, value in motion_row(outcome, motion).items():
+                cases.setdefault(name, []).append(value)
+            replay = ""
+            if version.folder is not None:
+                replay = command("replay", version.folder, outcome.index, gui=True)
+            words = cause(outcome, motion)
+            side = {"version": f"{number}  {version.vut}", "words": words, "replay": replay}
+            sides.append({"case": place, **side})
+        case = one.later.case
+        title = f"Case {one.later.index} · POV level {level_name(case.level)}, {described(case)}"
+        name = f"{later}-case-{one.later.index}"
+        pairs.append({"title": title, "name": name, "sides": sides})
+    speeds, offsets = packed(motions)
+    cases["offset"] = [offsets.get(place, 0) for place in range(2 * len(shown))]
+    drawn = player_data(scenario, road_or_shipped(scenario))
+    return {"pairs": pairs, "cases": cases, "speeds": speeds, **drawn}

@@ -9,13 +9,12 @@ from merge_sumo.analysis.stress import STRESS
 from merge_sumo.analysis.surface import Surface, learn_surface
 from merge_sumo.campaigns.printed_commands import campaign_command
 from merge_sumo.campaigns.recorded import RecordedCampaign, failures, regions_of, spread_failures
-from merge_sumo.errors import UserError
 from merge_sumo.metrics.cause import Diagnosis, Kind, diagnose
 from merge_sumo.metrics.failure_boxes import FailureBox, failure_boxes
 from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.metrics.summary import ErrorGroup, by_case, summarise
 from merge_sumo.reports.facts import facts_of
-from merge_sumo.road.loader import road_for, road_of
+from merge_sumo.road.loader import road_or_shipped
 from merge_sumo.scenario.case import coordinates
 from merge_sumo.scenario.scenario import LEVELS
 
@@ -73,11 +72,7 @@ class ReportModel:
             learns: whether to learn a surrogate of each level, which takes seconds.
         """
         self.run, self.learns = run, learns
-        try:
-            self.road = road_for(run.scenario)
-        except UserError:
-            # The net is gone: the motion is drawn on the shipped road.
-            self.road = road_of()
+        self.road = road_or_shipped(run.scenario)
         self.cases = run.cases
         runs = [case for case in by_case(run.outcomes) if case.runs > 1]
         self.repeated = {case.deciding(run.tolerated).index: case for case in runs}

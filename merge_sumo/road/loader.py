@@ -60,6 +60,18 @@ def road_of(
     return _found[key]
 
 
+def road_or_shipped(scenario: Scenario) -> Road:
+    """Return the road of a scenario to draw; the shipped one where its net is gone.
+
+    Args:
+        scenario: names the net and the edges of both paths.
+    """
+    try:
+        return road_for(scenario)
+    except UserError:
+        return road_of()
+
+
 def road_for(scenario: Scenario) -> Road:
     """Return the road of a scenario.
 

@@ -154,16 +154,20 @@ def test_what_does_not_compare_is_refused(tmp_path, run):
         compare([run, changed(tmp_path / "tolerant", run, tolerated=0.2)])
 
 
-def test_the_page_draws_both_motions_or_says_that_none_is_recorded(run):
+def test_the_page_has_both_motions_of_each_listed_case_for_one_player(run):
     compared = compare([run, run])
-    root: Any = html.fromstring(pages.comparison_page(compared))
-    for details in root.xpath("//details"):
-        lines = details.xpath(".//polyline/@points")
-        assert lines[::2] == lines[1::2], "the earlier motion of a car, then the later one"
-        assert len(lines) == 8, "speeds and positions of two cars in two motions"
-    for version in compared.versions:
-        object.__setattr__(version, "motion", lambda _: None)
-    assert "No motion is recorded." in pages.comparison_page(compared)
+    for motion, rows in ((run.trajectory, len(run.trajectory(0).whole)), (lambda _: None, 0)):
+        for version in compared.versions:
+            object.__setattr__(version, "motion", motion)
+        root: Any = html.fromstring(pages.comparison_page(compared))
+        data = json.loads(root.get_element_by_id("data").text)
+        failing = [outcome.index for outcome in run.outcomes if outcome.failed]
+        listed = [int(button.text) for button in root.xpath("//button[@data-pair]")]
+        assert sorted(listed) == failing
+        # A row for each version, of all cases for one player.
+        assert data["cases"]["index"] == [index for index in listed for _ in range(2)]
+        assert (0 in data["cases"]["rows"]) == (rows == 0)
+        assert len(root.xpath("//input[@id='time']")) == 1
 
 
 @pytest.mark.parametrize(

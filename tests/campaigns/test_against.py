@@ -128,7 +128,7 @@ def test_gate_and_page_name_what_broke(call):
         count == sum(broke(outcome.case) for outcome in RecordedCampaign(Path("run")).outcomes) > 0
     )
     assert f"gate regressions: met ({count} regression" in said.err
-    assert f'<h2 id="change-1-1">Broke: {count}</h2>' in Path("run/against.html").read_text()
+    assert f"<h3>Broke: {count}</h3>" in Path("run/against.html").read_text()
     assert "against.html" in Path("run/report.html").read_text()
     assert f'failures="{count}"' in Path("run.xml").read_text().split("against old.py:f")[1][:99]
 

@@ -14,11 +14,13 @@ import pytest
 from conftest import require
 from support.handmade import write_run
 
+from merge_sumo.analysis.comparison import compare
 from merge_sumo.analysis.explanation import EXPLANATIONS, Axis, Explanation
 from merge_sumo.campaigns.recorded import RecordedCampaign, failures, spread_failures
 from merge_sumo.metrics.merge import Conflict, Severity
 from merge_sumo.records import to_plain
 from merge_sumo.reports import report
+from merge_sumo.reports.comparison_page import comparison_page
 from merge_sumo.reports.text import changes
 from merge_sumo.scenario.scenario import DT_S
 
@@ -132,6 +134,29 @@ def test_a_reader_goes_through_the_page_by_mouse_and_by_keys(browser, made):
         page.emulate_media(media="print")
         assert not page.locator("#play").is_visible()
         assert page.locator(".levels").is_visible()
+
+
+def test_a_comparison_has_one_player_and_does_not_grow_with_its_cases(browser, tmp_path, made):
+    file = tmp_path / "page.html"
+    compared = compare([made, made])
+    file.write_text(comparison_page(compared))
+    with shown(browser, file, viewport={"width": 1400, "height": 900}) as page:
+        buttons = page.locator(".pairs button")
+        assert buttons.count() == len(failures(made.outcomes)) > 20
+        assert page.evaluate("document.documentElement.scrollHeight") < 2800
+        assert page.locator(".tally .number").nth(4).bounding_box()["y"] < 300
+        assert page.locator("#play").bounding_box()["y"] < 800
+        buttons.first.focus()
+        page.keyboard.press("ArrowDown")
+        assert page.inner_text("#case-title").split()[1] == buttons.nth(1).inner_text()
+        assert page.locator(".view:visible").count() == 2
+        assert page.locator("#chart-speed .line").count() == 4
+        page.locator(".map [data-pair='0']").click(force=True)
+        linked = page.url
+        assert page.inner_text("#case-title").split()[1] == buttons.first.inner_text()
+    with shown(browser, file) as page:
+        page.goto(linked)
+        assert f"-case-{chosen(page)}" in linked
 
 
 def rows(page) -> list[int]:

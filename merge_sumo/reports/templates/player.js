@@ -112,7 +112,7 @@ function animate(first, flags, more, earlier = null) {
   ];
   slider.max = final;
   const motions = earlier === null ? [first] : [earlier, first];
-  views.forEach((view, n) => view.show(motions[n]));
+  views.forEach((view, n) => motions[n] && view.show(motions[n]));
 }
 const extent = (values) => [Math.min(...values), Math.max(...values)];
 function pose(path, along) { // front bumper at a lane coordinate of a path
