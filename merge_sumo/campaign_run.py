@@ -163,9 +163,9 @@ class CampaignRun(Result):
     def to_record(self) -> dict[str, Any]:
         """Return the object that `merge-sumo campaign --json` prints.
 
-        `contacts` counts failures in which bodies touch at or after the merge point; `shares` has
-        the uniform starts of each level, of which `failures` fail and `without_verdict` are not
-        judged; `worst_case` is the index of the failure with the lowest margin.
+        `contacts` counts failures in which bodies overlap; `shares` has the uniform starts of each
+        level, of which `failures` fail and `without_verdict` are not judged; `worst_case` is the
+        index of the failure with the lowest margin.
         """
         shares, worst = SHARES.read(self.folder), failures(self.recorded.cases)
         return {

@@ -49,7 +49,7 @@ CRITERIA = {
         "score < -500",
         "front bumpers are within 6 m when the VUT reaches M: a contact or a conflict",
     ),
-    "contact": NamedCriterion("clearance_m <= 0", "a contact: bodies touch"),
+    "contact": NamedCriterion("clearance_m <= 0", "a contact: bodies overlap"),
     "unsafe": NamedCriterion(
         "clearance_m <= 0 or brake_after_mps2 > 3",
         "a contact, or the rear vehicle must brake harder than the 3 m/s2 that UN Regulation "

@@ -22,21 +22,19 @@ import inspect
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 from traceback import extract_tb
 from typing import Any, Generic, Literal, TypeVar
 
 import numpy as np
 
 from merge_sumo.errors import UserError
-from merge_sumo.metrics.bodies import CentreLines, closest_before_m
+from merge_sumo.metrics.bodies import NONE_MET, CentreLines, Encounter, encounters, gaps_m
 from merge_sumo.metrics.merge import (
     HARSH_MPS2,
     STANDS_MPS,
     Severity,
     brake_after_mps2,
-    closest_after_m,
-    gaps_m,
     last_avoidable_s,
     neighbours,
     place_of_merge_m,
@@ -171,8 +169,6 @@ class Measures:
         >>> measures.severity, measures.ttc_s
     """
 
-    __slots__ = ("lines", "trajectory", "values")
-
     def __init__(
         self,
         trajectory: Trajectory | None = None,
@@ -239,6 +235,11 @@ class Measures:
         """The result of the episode in a word: its severity, or its end where it has none."""
         return self.severity or self.end.value
 
+    @cached_property
+    def encounter(self) -> Encounter:
+        """The contact of the episode, and its clearance before M."""
+        return NONE_MET if self.end.is_error else encounters([self.trajectory], self.lines)[0]
+
     @property
     def is_close(self) -> bool:
         """Whether the front bumpers were nearer at M than the paper allows: its rule of a crash."""
@@ -294,12 +295,12 @@ class Measures:
     def severity(self) -> Severity | None:
         """Contact, conflict, harsh or safe (`merge.py`).
 
-        None where the VUT never reached M, and after an error.
+        None without a contact where the VUT never reached M, and after an error.
         """
+        if self.encounter.row is not None:
+            return Severity.CONTACT
         if self.end is not End.MERGED:
             return None
-        if self.clearance_m is not None and self.clearance_m <= 0.0:
-            return Severity.CONTACT
         if self.is_close:
             return Severity.CONFLICT
         return Severity.HARSH if (self.after_brake_mps2 or 0.0) > HARSH_MPS2 else Severity.SAFE
@@ -313,13 +314,14 @@ class Measures:
         """
         return min((car.gap_m for car in neighbours(self.trajectory)), default=None)
 
-    @measure(worse="low", label="smallest gap from M on", column="clearance")
+    @measure(worse="low", label="smallest gap from M on, or overlap", column="clearance")
     def clearance_m(self) -> float | None:
-        """Smallest gap between bumpers from M on, to the end of the follow-up.
+        """Smallest gap between bumpers from M on, or less where bodies overlap, also before M.
 
-        0 or less where bodies touch, None without a merge.
+        0 or less with a contact, None without a contact and a merge.
         """
-        return closest_after_m(self.trajectory)[0]
+        found = self.bumper_gap_m, self.after_gap_m, self.encounter.overlap_m
+        return min(value for value in found if value is not None)
 
     @measure(worse="low", label="smallest clearance before M", column="clearance before M")
     def before_clearance_m(self) -> float | None:
@@ -327,9 +329,7 @@ class Measures:
 
         0 or less where they overlap, None where the VUT never came there.
         """
-        if self.lines is None or self.end.is_error:
-            return None
-        return closest_before_m([self.trajectory], self.lines)[0]
+        return self.encounter.before_m
 
     @measure(worse="high", label="deceleration to keep 6 m apart")
     def drac_mps2(self) -> float | None:
@@ -396,8 +396,8 @@ class Measures:
 
     @measure(worse="high", label="impact speed", column="impact")
     def impact_speed_mps(self) -> float | None:
-        """Relative speed at the first contact; None without one."""
-        return closest_after_m(self.trajectory)[1]
+        """Relative speed, in the plane, as bodies first overlap; None without a contact."""
+        return self.encounter.impact_mps
 
     @measure()
     def merged_first(self) -> Literal["VUT", "POV"] | None:
@@ -618,19 +618,15 @@ def recorded_measures(scenario: Scenario) -> dict[str, Measure[Any]]:
 def measures_of(trajectories: Sequence[Trajectory], lines: CentreLines | None) -> list[Measures]:
     """Return the measures of episodes of one scenario.
 
-    Clearances before M are computed for all episodes at once, which is faster.
+    Encounters are computed for all episodes at once, which is faster.
 
     Args:
         trajectories: the motions.
-        lines: centre lines of the road; None for no clearance before M.
+        lines: centre lines of the road; None for none before M.
     """
     measures = [Measures(trajectory, lines) for trajectory in trajectories]
-    if lines is not None:
-        closest_m = closest_before_m(trajectories, lines)
-        for one, clearance_m in zip(measures, closest_m, strict=True):
-            if not one.end.is_error:
-                is_near = math.isfinite(clearance_m)
-                one.values["before_clearance_m"] = clearance_m if is_near else None
+    for one, encounter in zip(measures, encounters(trajectories, lines), strict=True):
+        one.encounter = NONE_MET if one.end.is_error else encounter
     return measures
 
 

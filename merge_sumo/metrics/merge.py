@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from merge_sumo.errors import UserError
-from merge_sumo.scenario.case import FloatArray
+from merge_sumo.metrics.bodies import CentreLines, encounters, gaps_m, one_lane_row
 from merge_sumo.scenario.scenario import DT_S, VUT, Scenario
 from merge_sumo.scenario.trajectory import End, Trajectory
 
@@ -108,42 +108,6 @@ def brake_after_mps2(trajectory: Trajectory) -> float:
     return max(needed_mps2)
 
 
-def closest_after_m(trajectory: Trajectory) -> tuple[float, float | None]:
-    """Return the smallest clearance from M on, in m, and the speed of the first contact, in m/s.
-
-    Args:
-        trajectory: the motion; without a follow-up it ends at M.
-
-    Returns:
-        The clearance is infinite without a merge, the speed None without a contact.
-    """
-    if trajectory.end is not End.MERGED:
-        return math.inf, None
-    after = trajectory.motion[-1:] if trajectory.after is None else trajectory.after
-    gap_m, closing_mps = gaps_m(after, trajectory.case.scenario.lengths_m)
-    touching = np.argwhere(gap_m <= 0.0)
-    if not len(touching):
-        return float(gap_m.min()), None
-    first = gap_m[touching[0, 0]] <= 0.0
-    return float(gap_m.min()), float(np.abs(closing_mps[touching[0, 0]][first]).max())
-
-
-def gaps_m(after: FloatArray, lengths_m: tuple[float, float]) -> tuple[FloatArray, FloatArray]:
-    """Return the bumper gaps and closing speeds of the VUT and each other car in one lane.
-
-    Args:
-        after: x and v of all vehicles, (T, A, 2) or more columns, in m and m/s.
-        lengths_m: lengths of a car of the mainline and of the VUT.
-
-    Returns:
-        Gaps, negative where bodies overlap, and speeds, negative where gaps open: (T, A - 1) each.
-    """
-    apart = np.delete(after, VUT, axis=1) - after[:, [VUT]]
-    dx, dv = apart[:, :, 0], apart[:, :, 1]
-    length_m = np.where(dx >= 0.0, *lengths_m)
-    return np.abs(dx) - length_m, np.where(dx >= 0.0, -dv, dv)
-
-
 class Severity(StrEnum):
     """Classes of encounters, the most severe first; an episode is of the first that fits."""
 
@@ -161,14 +125,14 @@ def meanings(scenario: Scenario) -> dict[Severity, str]:
     """
     soon = f"within {scenario.follow_up_s:g} s after"
     found = {
-        Severity.CONTACT: f"bodies touch at M or {soon} it",
+        Severity.CONTACT: f"bodies overlap before M or {soon} it",
         Severity.CONFLICT: f"front bumpers within {scenario.dx_crash_m:g} m at M, no contact",
         Severity.HARSH: f"a car behind brakes harder than {HARSH_MPS2:g} m/s² {soon} M",
         Severity.SAFE: "none of these",
     }
     if not scenario.follow_up_s:
         del found[Severity.HARSH]
-        found[Severity.CONTACT] = "bodies touch at M"
+        found[Severity.CONTACT] = "bodies overlap, up to M"
     return {severity: scenario.wording(meaning) for severity, meaning in found.items()}
 
 
@@ -188,15 +152,15 @@ def check_from(from_s: float | None) -> None:
 class Conflict(NamedTuple):
     """The first conflict of an episode.
 
-    With the VUT in the lane of the mainline it is the contact, where bodies first overlap, else the
-    lowest time to collision between bumpers, else the merge. Without a merge it is the end.
+    It is the contact, where bodies first overlap. Else, with the VUT in the lane of the mainline,
+    it is the lowest time to collision between bumpers, or the merge. Without a merge it is the end.
 
     Attributes:
         row: row of the whole motion.
         what: its kind in words, such as "the contact".
 
     Example:
-        >>> Conflict.of(trajectory)
+        >>> Conflict.of(trajectory, lines)
         Conflict(row=81, what='the contact')
     """
 
@@ -204,34 +168,26 @@ class Conflict(NamedTuple):
     what: str
 
     @classmethod
-    def find(cls, motion: FloatArray, merges: int | None, lengths_m: tuple[float, float]) -> Self:
-        """Return the first conflict of a motion.
-
-        Args:
-            motion: x and v of all vehicles, (T + 1, A, 2), m and m/s.
-            merges: first row in which the VUT is on the mainline; None for never.
-            lengths_m: lengths of a car of the mainline and of the VUT.
-        """
-        if merges is None:
-            return cls(len(motion) - 1, "the end of the episode")
-        gap_m, closing_mps = gaps_m(motion[merges:], lengths_m)
-        ttc_s = np.divide(gap_m, closing_mps, out=gap_m + np.inf, where=closing_mps > 0.0)
-        lowest_s = np.where(gap_m <= 0.0, 0.0, ttc_s).min(axis=1)
-        row = int(lowest_s.argmin())
-        found = {0.0: "the contact", np.inf: "the merge" if merges else "the start"}
-        return cls(merges + row, found.get(lowest_s[row], "the lowest time to collision"))
-
-    @classmethod
-    def of(cls, trajectory: Trajectory) -> Self:
+    def of(cls, trajectory: Trajectory, lines: CentreLines | None) -> Self:
         """Return the first conflict of an episode.
 
         Args:
             trajectory: the motion.
+            lines: centre lines of the road; None to look for a contact from M on only.
         """
-        scenario = trajectory.case.scenario
-        merges = len(trajectory.motion) - 1 if trajectory.end is End.MERGED else None
-        in_one_lane = scenario.ramp == scenario.mainline
-        return cls.find(trajectory.whole, 0 if in_one_lane else merges, scenario.lengths_m)
+        (encounter,) = encounters([trajectory], lines)
+        if encounter.row is not None:
+            return cls(encounter.row, "the contact")
+        merges, whole = one_lane_row(trajectory), trajectory.whole
+        if merges == len(whole):
+            return cls(merges - 1, "the end of the episode")
+        gap_m, closing_mps = gaps_m(whole[merges:], trajectory.case.scenario.lengths_m)
+        ttc_s = np.divide(gap_m, closing_mps, out=gap_m + np.inf, where=closing_mps > 0.0)
+        lowest_s = ttc_s.min(axis=1)
+        row = int(lowest_s.argmin())
+        if np.isinf(lowest_s[row]):
+            return cls(merges + row, "the merge" if merges else "the start")
+        return cls(merges + row, "the lowest time to collision")
 
     def begin(self, from_s: float | None) -> tuple[int, list[str]]:
         """Return the row some time before the conflict, and lines that say so.

@@ -271,7 +271,7 @@ class Summary:
     Attributes:
         cases: cases that ran.
         failures: failing cases, without the undecided ones.
-        contacts: failures in which bodies touch at or after the merge point.
+        contacts: failures in which bodies overlap.
         errors: cases that ended as VUT_ERROR or SIM_ERROR.
         timeouts: cases in which the VUT never reached its goal, unless that is a failure.
         undecided_cases: deciding runs, by index, of failing cases with too few runs to decide.

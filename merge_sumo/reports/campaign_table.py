@@ -147,7 +147,7 @@ def _remarks(
     """Yield labels, and the lines behind each."""
     yield "Not judged:", [line.strip() for line in summary.error_lines()]
     if CONTACT in of:
-        contacts = f"{_counted(of[CONTACT], 'case')} with contact after the merge point"
+        contacts = f"{_counted(of[CONTACT], 'case')} with contact"
         yield "Not counted:", [f"{contacts} (`fail_when` unsafe counts them)"]
     if not has_shares and PROBABILITY_TO_FAIL not in of:
         measure = campaign_command("probability", run.folder, run.record)

@@ -21,6 +21,7 @@ from merge_sumo.reports.pages import ERROR_CHARACTERS
 from merge_sumo.reports.report_model import ReportModel
 from merge_sumo.reports.text import causes, changes, name_and_unit
 from merge_sumo.road.drawing import road_data
+from merge_sumo.road.loader import centre_lines
 from merge_sumo.road.road import Road
 from merge_sumo.scenario.case import FloatArray, to_unit
 from merge_sumo.scenario.scenario import ALL_LEVELS, DT_S, VEHICLES, Scenario, level_name
@@ -133,7 +134,7 @@ def _row(model: ReportModel, outcome: Outcome) -> dict[str, Any]:
     row: dict[str, Any] = {
         **motion_row(outcome, motion),
         "level": outcome.case.level,
-        "conflict": None if motion is None else [*Conflict.of(motion)],
+        "conflict": None if motion is None else [*Conflict.of(motion, centre_lines(model.road))],
         "error": measures.error and shortened(measures.error, ERROR_CHARACTERS),
         "severity": measures.severity,
         "failed": outcome.failed,

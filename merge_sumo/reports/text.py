@@ -36,6 +36,7 @@ from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.metrics.plausibility import late_errors
 from merge_sumo.printable import counted, either, printable
 from merge_sumo.result import lines_of
+from merge_sumo.road.loader import centre_lines, road_for
 from merge_sumo.scenario.case import Case, coordinates, described
 from merge_sumo.scenario.scenario import DT_S, VEHICLES, level_name
 from merge_sumo.scenario.trajectory import Trajectory
@@ -546,8 +547,9 @@ def episode_lines(
         trajectory: its motion.
         from_s: begin of the table in s before the first conflict, such as -3.
     """
-    first, begins = Conflict.of(trajectory).begin(from_s)
     case = outcome.case
+    lines_of_road = centre_lines(road_for(case.scenario))
+    first, begins = Conflict.of(trajectory, lines_of_road).begin(from_s)
     lines = [
         f"case: level {level_name(case.level)}, {described(case)}",
         cause(outcome, trajectory),

@@ -22,6 +22,7 @@ from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.records import convert, read_record, to_json
 from merge_sumo.result import Result
 from merge_sumo.road.finder import FARTHEST_M
+from merge_sumo.road.loader import centre_lines
 from merge_sumo.road.road import Road
 from merge_sumo.road.xml_input import RECORD_TAGS, parse_xml, read_xml
 from merge_sumo.scenario.case import FloatArray
@@ -121,7 +122,7 @@ def replay(folder: Path, from_s: float | None = None) -> Replay:
         True
     """
     episode = _read(folder)
-    first, begins = Conflict.of(episode.trajectory).begin(from_s)
+    first, begins = episode.conflict.begin(from_s)
     with _staged(episode, first) as (stage, arguments):
         arguments += ["--fcd-output", REPLAYED, "--device.fcd.begin", f"{first * DT_S:.1f}"]
         arguments += ["--precision", "9", "--no-step-log", "true"]
@@ -166,7 +167,7 @@ def open_gui(folder: Path, from_s: float | None = None, *, silent: bool = False)
         UserError: sumo-gui failed, or the folder is not a replay folder.
     """
     episode = _read(folder)
-    first, begins = Conflict.of(episode.trajectory).begin(from_s)
+    first, begins = episode.conflict.begin(from_s)
     if not silent:
         for sentence in begins:
             notice(sentence)
@@ -183,6 +184,11 @@ class _Episode:
     outcome: Outcome
     trajectory: Trajectory
     record: FloatArray
+
+    @property
+    def conflict(self) -> Conflict:
+        """The first conflict."""
+        return Conflict.of(self.trajectory, centre_lines(self.road))
 
 
 def _read(folder: Path) -> _Episode:

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from merge_sumo.errors import UserError
+from merge_sumo.metrics.bodies import CentreLines
 from merge_sumo.metrics.merge import Conflict, check_from
 from merge_sumo.scenario.case import Case, FloatArray
 from merge_sumo.scenario.scenario import US23
 from merge_sumo.scenario.trajectory import End, Trajectory, cut_at
 
-LENGTHS_M = (5.0, 5.0)
+CASE = Case(level=0, x_pov0_m=-250.0, v_pov0_mps=30.0, scenario=US23)
 
 
 def motion(gaps_m: list[float], closing_mps: list[float]) -> FloatArray:
@@ -26,7 +28,7 @@ def motion(gaps_m: list[float], closing_mps: list[float]) -> FloatArray:
 @pytest.mark.parametrize(
     ("gaps_m", "closing_mps", "expected"),
     [
-        # Bodies overlap before the merge, which is row 2, and again in rows 4 and 5.
+        # Of an unknown road: bodies overlap before the merge, row 2, and again in rows 4 and 5.
         ([-1.0, 9.0, 4.0, 1.0, 0.0, -2.0], [5.0] * 6, (4, "the contact")),
         # 2, 1.5 and 3 s; then as low again, which is not the first.
         ([1.0, 1.0, 4.0, 3.0, 3.0, 1.5], [9.0, 9.0, 2.0, 2.0, 1.0, 1.0], (3, "the lowest time to")),
@@ -36,34 +38,41 @@ def motion(gaps_m: list[float], closing_mps: list[float]) -> FloatArray:
 def test_is_looked_for_from_the_merge_on(
     gaps_m: list[float], closing_mps: list[float], expected: tuple[int, str]
 ) -> None:
-    whole = motion(gaps_m, closing_mps)
-    row, what = Conflict.find(whole, 2, LENGTHS_M)
+    before, after = cut_at(motion(gaps_m, closing_mps), 2)
+    row, what = Conflict.of(Trajectory(CASE, before, End.MERGED, after=after), None)
     assert (row, what.startswith(expected[1])) == (expected[0], True)
-    case = Case(level=0, x_pov0_m=-250.0, v_pov0_mps=30.0, scenario=US23)
-    before, after = cut_at(whole, 2)
-    assert Conflict.of(Trajectory(case, before, End.MERGED, after=after)) == (row, what)
 
 
-def test_is_the_end_without_a_merge() -> None:
-    case = Case(level=0, x_pov0_m=-250.0, v_pov0_mps=30.0, scenario=US23)
-    trajectory = Trajectory(case, motion([-1.0, 2.0, 1.0], [5.0] * 3), End.TIMEOUT)
-    assert Conflict.of(trajectory) == (2, "the end of the episode")
+@pytest.mark.parametrize(
+    ("gaps_m", "end", "expected"),
+    [
+        ([1.0, 2.0, 1.0], End.TIMEOUT, (2, "the end of the episode")),
+        ([3.0, -1.0, 9.0], End.TIMEOUT, (1, "the contact")),
+        ([3.0, -1.0, 9.0], End.MERGED, (1, "the contact")),
+    ],
+)
+def test_is_a_contact_also_before_the_merge(gaps_m, end, expected) -> None:
+    straight = np.array([[-400.0, -400.0, 0.0], [400.0, 400.0, 0.0]])
+    trajectory = Trajectory(CASE, motion(gaps_m, [5.0] * 3), end)
+    assert Conflict.of(trajectory, CentreLines.of(straight, straight)) == expected
 
 
 @pytest.mark.parametrize(
     ("gaps_m", "expected"), [([3.0, -1.0], (1, "the contact")), ([3.0, 4.0], (0, "the start"))]
 )
 def test_of_cars_in_one_lane_is_looked_for_from_the_start_on(gaps_m, expected) -> None:
-    closing_mps = 1.0 if expected[0] else -1.0
-    assert Conflict.find(motion(gaps_m, [closing_mps] * 2), 0, LENGTHS_M) == expected
+    case = replace(CASE, scenario=replace(US23, ramp=US23.mainline))
+    cars = motion(gaps_m, [1.0 if expected[0] else -1.0] * 2)
+    assert Conflict.of(Trajectory(case, cars, End.TIMEOUT), None) == expected
 
 
-def test_takes_the_length_of_the_car_ahead() -> None:
-    # The front bumper of the POV is 5 m behind that of the VUT, then ahead of it.
-    behind = motion([0.0], [1.0])
-    ahead = behind[:, ::-1] * [1.0, -1.0, 1.0]
-    assert Conflict.find(behind, 0, (4.9, 5.0)).what == "the contact"
-    assert Conflict.find(ahead, 0, (5.0, 4.9)).what == "the contact"
+@pytest.mark.parametrize(("pov_m", "vut_m", "row"), [(4.9, 5.0, 0), (5.0, 4.9, 1)])
+def test_takes_the_length_of_the_car_ahead(pov_m: float, vut_m: float, row: int) -> None:
+    # The front bumper of the POV is 5 m behind that of the VUT, or ahead of it.
+    cars = motion([0.0], [1.0])
+    cars = cars[:, ::-1] * [1.0, -1.0, 1.0] if row else cars
+    case = replace(CASE, scenario=replace(US23, pov_length_m=pov_m, vut_length_m=vut_m))
+    assert Conflict.of(Trajectory(case, cars, End.MERGED), None).what == "the contact"
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ from support.campaigning import campaign_settings, run_campaign
 
 from merge_sumo.campaigns.recorded import RecordedCampaign
 from merge_sumo.errors import UserError
-from merge_sumo.metrics.bodies import SPACING_M, CentreLines, closest_before_m
+from merge_sumo.metrics.bodies import SPACING_M, CentreLines, encounters
 from merge_sumo.metrics.criterion import PAPER_CRITERION, Criterion, vocabulary
 from merge_sumo.metrics.expression import MOST_MARGIN, parse_condition
 from merge_sumo.metrics.measures import Measures
@@ -56,7 +56,7 @@ def of(expression, trajectory):
 
 def nearest(trajectory, lines):
     """Return the smallest clearance before M."""
-    return closest_before_m([trajectory], lines)[0]
+    return encounters([trajectory], lines)[0].before_m
 
 
 class TestMargins:
@@ -201,6 +201,13 @@ def lines(apart_m, ends_m=-20.0):
     return CentreLines.of(mainline, np.array([[x, x, side] for x, side in [*y, (400.0, 0.0)]]))
 
 
+def lines_that_cross():
+    """Return a mainline along y = 0 and a ramp at a right angle to it."""
+    mainline = np.array([[-400.0, -400.0, 0.0], [400.0, 400.0, 0.0]])
+    ramp = np.array([[-400.0, 0.0, -400.0], [0.0, 0.0, 0.0], [400.0, 400.0, 0.0]])
+    return CentreLines.of(mainline, ramp)
+
+
 def side_by_side(dx, x_vut=-5.0):
     """Return an episode of one step in which the VUT is still before M."""
     motion = np.array([[[x_vut + dx, 20.0, 0.0], [x_vut, 20.0, 0.0]]])
@@ -222,10 +229,8 @@ class TestBodiesBeforeM:
         assert found == pytest.approx(clearance)
 
     def test_that_cross_by_hand(self):
-        # A ramp from the right angle: its car's nose, at y = -2, is 1.1 m from the other's side.
-        mainline = np.array([[-400.0, -400.0, 0.0], [400.0, 400.0, 0.0]])
-        ramp = np.array([[-400.0, 0.0, -400.0], [0.0, 0.0, 0.0], [400.0, 400.0, 0.0]])
-        crossing = CentreLines.of(mainline, ramp)
+        # The nose of the car on the ramp, at y = -2, is 1.1 m from the side of the other.
+        crossing = lines_that_cross()
         assert crossing.together_m == 2.5
         ahead = Trajectory(CASE, np.array([[[2.5, 20.0, 0.0], [-2.0, 0.0, 0.0]]]), End.TIMEOUT)
         assert nearest(ahead, crossing) == pytest.approx(1.1)
@@ -235,10 +240,25 @@ class TestBodiesBeforeM:
         assert lines(3.2).together_m == pytest.approx(1.0, abs=SPACING_M)
         assert nearest(side_by_side(0.0, x_vut=-30.0), lines(1.0)) == math.inf
 
-    def test_before_m_are_a_measure_of_their_own(self):
-        touching = Measures.of(side_by_side(0.0), lines(1.0))
-        assert touching.before_clearance_m == pytest.approx(-0.8)
-        assert (touching.severity, touching.impact_speed_mps) == (None, None)
+    def test_that_overlap_are_a_contact_whether_the_vut_merges_or_not(self):
+        # The POV overtakes a VUT at -5 m; they overlap in the second row.
+        motion = np.array([[[-13.0, 30.0, 0.0], [-5.0, 12.0, 0.0]]] * 3)
+        motion[1:, 0] = (-9.5, 20.0, 0.0), (90.0, 20.0, 0.0)
+        merged = np.concatenate((motion[:2], [[[90.0, 20.0, 0.0], [0.0, 12.0, 0.0]]]))
+        for rows, end in ((motion, End.TIMEOUT), (merged, End.MERGED)):
+            found = Measures.of(Trajectory(CASE, rows, end), lines(1.0))
+            assert (found.severity, found.impact_speed_mps) == ("contact", 8.0)
+            assert found.before_clearance_m == found.clearance_m == pytest.approx(-0.5)
+        assert Measures.of(Trajectory(CASE, motion, End.TIMEOUT), lines(2.0)).severity is None
+        assert Measures.of(Trajectory(CASE, motion, End.VUT_ERROR), lines(1.0)).severity is None
+        # Where the road is unknown, only M and what follows are looked at.
+        unknown = Measures.of(Trajectory(CASE, merged, End.MERGED))
+        assert (unknown.severity, unknown.clearance_m) == ("safe", 85.0)
+
+    def test_that_cross_meet_at_the_speed_of_one_relative_to_the_other(self):
+        motion = np.array([[[2.0, 3.0, 0.0], [-0.5, 4.0, 0.0]]])
+        (met,) = encounters([Trajectory(CASE, motion, End.TIMEOUT)], lines_that_cross())
+        assert met.impact_mps == 5.0
 
 
 class TestOutcomes:

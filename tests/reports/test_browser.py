@@ -22,7 +22,8 @@ from merge_sumo.records import to_plain
 from merge_sumo.reports import report
 from merge_sumo.reports.comparison_page import comparison_page
 from merge_sumo.reports.text import changes
-from merge_sumo.scenario.scenario import DT_S
+from merge_sumo.road.loader import centre_lines, road_for
+from merge_sumo.scenario.scenario import DT_S, US23
 
 EVIL = "<script>alert(1)</script><img src=x onerror=alert(2)>"
 
@@ -96,7 +97,7 @@ def test_a_reader_goes_through_the_page_by_mouse_and_by_keys(browser, made):
         page.locator("#copy:text('Copied')").wait_for()
         command = f"merge-sumo replay {made.folder} {worst[0]} --gui"
         assert page.evaluate("navigator.clipboard.readText()") == command
-        conflict = Conflict.of(made.trajectory(worst[0]))
+        conflict = Conflict.of(made.trajectory(worst[0]), centre_lines(road_for(US23)))
         row, what = conflict.row, f"{conflict.what} at {conflict.row / 10:.1f} s"
         assert page.locator("#before").get_attribute("title") == f"Plays from 3 s before {what}"
         # In one go, before the animation has its first frame.

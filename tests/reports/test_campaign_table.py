@@ -24,7 +24,7 @@ POV level   all starts that fail      failures found   regions    FMC
 1           1.1 %  (0.69 to 1.7)                  44         2   .102
 2           0.2 %  (0.06 to 0.51)                136         7   .018
 
-Not counted: 25 cases with contact after the merge point (`fail_when` unsafe counts them)
+Not counted: 25 cases with contact (`fail_when` unsafe counts them)
 Avoidable:   all 180 by careful, fsm, reg157, rss; 169 by a careful POV
 Worst:       case 157, late brake, contact at 12.2 m/s
              merge-sumo replay runs/latest 157 --gui"""

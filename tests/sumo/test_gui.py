@@ -18,7 +18,8 @@ from merge_sumo.campaigns.campaign import export_case
 from merge_sumo.campaigns.recorded import failures
 from merge_sumo.metrics.cause import cause
 from merge_sumo.metrics.merge import Conflict
-from merge_sumo.scenario.scenario import COLOURS, DT_S
+from merge_sumo.road.loader import centre_lines, road_for
+from merge_sumo.scenario.scenario import COLOURS, DT_S, US23
 from merge_sumo.sumo.replay_folder import LABELS, VIEW
 
 PICTURE_TIMES_S = (2.0, 7.0)
@@ -135,7 +136,7 @@ def test_it_begins_before_the_conflict_and_looks_the_same_from_there_on(
 ):
     index = failures(run.outcomes)[0].index
     export_case(run, index, tmp_path / "case")
-    begin_s = Conflict.of(run.trajectory(index)).row * DT_S - 3.0
+    begin_s = Conflict.of(run.trajectory(index), centre_lines(road_for(US23))).row * DT_S - 3.0
     assert PICTURE_TIMES_S[0] < begin_s - 0.2 < begin_s < PICTURE_TIMES_S[1]
     (taken,) = taken_of(tmp_path / "case", display, tmp_path, "--from", "-3")
     assert (taken == pictures[1]).all()

@@ -11,6 +11,7 @@ from support.campaigning import campaign_settings, run_campaign
 
 from merge_sumo.campaigns.campaign import export_case
 from merge_sumo.metrics.merge import Conflict
+from merge_sumo.road.loader import centre_lines, road_for
 from merge_sumo.road.scenario_file import named_scenario, shipped_scenarios
 from merge_sumo.scenario.scenario import DT_S
 from merge_sumo.sumo import replay as replay_module
@@ -19,7 +20,7 @@ from merge_sumo.sumo.replay import REPLAYED, replay
 from merge_sumo.sumo.replay_folder import RECORD
 
 STALEMATE = Path(__file__).parents[2] / "scenarios" / "roundabout-stalemate"
-"""VUT and POV touch as the VUT reaches M, at 11.5 s, and both have crossed junctions by then."""
+"""VUT and POV touch at 9.3 s, before M, and both have crossed junctions by then."""
 
 
 @pytest.fixture
@@ -57,18 +58,19 @@ def test_sumo_writes_the_same_bytes_from_there_on(name, assert_continues, tmp_pa
         vut="design2", levels=(0, 1), cases=2, batch=2, seed=1, scenario=named_scenario(name)
     )
     run = run_campaign(settings, tmp_path / "run")
+    lines = centre_lines(road_for(named_scenario(name)))
     for outcome in run.outcomes:
         folder = tmp_path / str(outcome.index)
         export_case(run, outcome.index, folder)
-        at_s = Conflict.of(run.trajectory(outcome.index)).row * DT_S
+        at_s = Conflict.of(run.trajectory(outcome.index), lines).row * DT_S
         assert_continues(folder, {s: max(at_s + s, 0.0) for s in (-3.0, 0.0)})
 
 
 def test_also_where_vehicles_are_inside_of_junctions(assert_continues):
-    before_s = [-0.1 * row for row in range(0, 116, 5)]
-    assert_continues(STALEMATE, {s: max(11.5 + s, 0.0) for s in before_s})
+    before_s = [-0.1 * row for row in range(0, 94, 4)]
+    assert_continues(STALEMATE, {s: max(9.3 + s, 0.0) for s in before_s})
     record = etree.parse(STALEMATE / RECORD).getroot()
-    lanes = [car.get("lane", "") for s in before_s for car in record[round((11.5 + s) * 10)]]
+    lanes = [car.get("lane", "") for s in before_s for car in record[round((9.3 + s) * 10)]]
     assert sum(lane.startswith(":") for lane in lanes) > 3
 
 
@@ -76,9 +78,9 @@ class TestTheCommand:
     def test_prints_the_begin_and_its_reason(self, command_line):
         code, out, _ = command_line("replay", STALEMATE, "--from", "-3")
         _, _, begins, verdict = out.splitlines()
-        assert (code, begins) == (0, "from 8.5 s, 3 s before the contact at 11.5 s")
-        # 8.5 to 14.6 s, and the 10 rows that hold the end: 71 rows of two cars.
-        assert verdict == "identical: 142 rows of x, y and speed"
+        assert (code, begins) == (0, "from 6.3 s, 3 s before the contact at 9.3 s")
+        # 6.3 to 14.6 s, and the 10 rows that hold the end: 93 rows of two cars.
+        assert verdict == "identical: 186 rows of x, y and speed"
 
     @pytest.mark.parametrize("number", ["3", "nan", "-inf"])
     @pytest.mark.parametrize("command", [("replay", STALEMATE), ("run",)])
