@@ -102,41 +102,31 @@ __all__ = ["AnyVut", "CampaignRun", "Car", "CaseRun", "Seen", "SeenBatch", "date
 P = ParamSpec("P")
 C = TypeVar("C")
 R = TypeVar("R")
-SIGNATURES: dict[str, inspect.Signature] = {}
-"""Arguments of each function, by its name."""
+KEYWORDS: dict[str, Sequence[str]] = {}
+"""Keywords of each function, by its name."""
 
 
 def checked(function: Callable[P, R], name: str = "") -> Callable[P, R]:
-    """Decorate a function so that wrong arguments raise a `UserError`.
+    """Decorate a function so that a keyword which it does not have raises a `UserError`.
 
     Args:
         function: the function.
         name: what users call it; by default its name.
     """
-    name, signature = name or function.__name__, inspect.signature(function)
-    SIGNATURES[name] = signature
+    name = name or function.__name__
+    own = KEYWORDS[name] = list(inspect.signature(function).parameters)
 
     @wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> R:
         for keyword in kwargs:
-            if keyword not in signature.parameters:
-                raise UserError(_unknown_keyword(name, keyword))
-        try:
-            signature.bind(*args, **kwargs)
-        except TypeError as error:
-            raise UserError(f"{name}: {error}") from error
+            if keyword not in own:
+                others = [other for other, known in KEYWORDS.items() if keyword in known]
+                where = f", which {either(sorted(others))} has" if others else ""
+                hint = meant(keyword, own) or f"choose {', '.join(own) or 'none'}"
+                raise UserError(f"{name} has no keyword `{keyword}`{where}: {hint}".rstrip())
         return function(*args, **kwargs)
 
     return call
-
-
-def _unknown_keyword(name: str, keyword: str) -> str:
-    """Return a sentence on a keyword that a function does not have."""
-    others = [verb for verb, known in SIGNATURES.items() if keyword in known.parameters]
-    where = f", which {either(sorted(others))} has" if others else ""
-    own = SIGNATURES[name].parameters
-    hint = meant(keyword, own) or f"choose {', '.join(own) or 'none'}"
-    return f"{name} has no keyword `{keyword}`{where}: {hint}".rstrip()
 
 
 def verb(config: Callable[P, C]) -> Callable[[Callable[[C], R]], Callable[P, R]]:

@@ -202,8 +202,8 @@ class CampaignRun(Result):
     def _against_lines(self) -> list[str]:
         if self.against is None:
             return []
-        page = f"changes: {self.folder / AGAINST_PAGE}"
-        return [*comparison_summary(self.against), page, ""]
+        page = labelled("Changes:", [str(self.folder / AGAINST_PAGE)])
+        return [*comparison_summary(self.against), *page, ""]
 
     def remarks(self) -> list[str]:
         """Return sentences on the gates, and one where no case could be judged."""

@@ -19,7 +19,7 @@ from merge_sumo.files import GENERATOR, replace_own
 from merge_sumo.metrics.cause import cause
 from merge_sumo.reports.pages import page
 from merge_sumo.reports.report_data import motion_row, packed, player_data
-from merge_sumo.reports.text import change_in_words, comparison_headline, fmc_rows
+from merge_sumo.reports.text import change_in_words, comparison_headline
 from merge_sumo.road.loader import road_or_shipped
 from merge_sumo.scenario.case import coordinates, described
 from merge_sumo.scenario.scenario import level_name
@@ -78,7 +78,6 @@ def comparison_page(compared: Comparison) -> str:
         compared=compared,
         groups=GROUPS,
         headline=comparison_headline(compared),
-        fmc=fmc_rows(compared),
         change_in_words=change_in_words,
         lists=lists,
         maps=_maps(shown),

@@ -97,7 +97,7 @@ def change_in_words(case: ComparedCase) -> str:
 
 
 def version_change_headline(version_change: VersionChange) -> str:
-    """Return the numbers of a change of version in a sentence: worse and better cases.
+    """Return the worse and better cases of a change of version in a clause.
 
     Args:
         version_change: the change of version.
@@ -115,7 +115,7 @@ def version_change_headline(version_change: VersionChange) -> str:
         parts.append(f"of {counted(len(version_change.cases), 'shared case')} {', '.join(numbers)}")
     else:
         parts.append("no case is shared")
-    return "; ".join(parts)
+    return f"from {later - 1} to {later}: {'; '.join(parts)}"
 
 
 def comparison_headline(compared: Comparison) -> str:
@@ -124,28 +124,8 @@ def comparison_headline(compared: Comparison) -> str:
     Args:
         compared: the comparison.
     """
-    parts = [" -> ".join(version.summary.counts for version in compared.versions)]
-    for version_change in compared.version_changes:
-        text = version_change_headline(version_change)
-        if len(compared.version_changes) > 1:
-            text = f"from {version_change.number - 1} to {version_change.number}: {text}"
-        parts.append(text)
-    return "; ".join(parts)
-
-
-def fmc_rows(compared: Comparison) -> dict[int, list[str]]:
-    """Return the FMC of the cases of each version as text, by level; "-" for no tested case.
-
-    Args:
-        compared: the comparison.
-    """
-    rows: dict[int, list[str]] = {}
-    for number, version in enumerate(compared.versions):
-        for level, summary in version.summary.levels.items():
-            row = rows.setdefault(level, ["-"] * len(compared.versions))
-            if summary.tested:
-                row[number] = f"{summary.fmc:.4f}"
-    return dict(sorted(rows.items()))
+    counts = " -> ".join(version.summary.counts for version in compared.versions)
+    return "; ".join([counts, *map(version_change_headline, compared.version_changes)])
 
 
 def comparison_summary(compared: Comparison) -> list[str]:
@@ -160,12 +140,15 @@ def comparison_summary(compared: Comparison) -> list[str]:
     width = max(map(len, names))
     lines = []
     for name, version in zip(names, compared.versions, strict=True):
-        lines.append(f"{name:<{width}}  {version.summary.counts}")
+        line = f"{name:<{width}}  {version.summary.counts}"
+        for level, found in version.summary.levels.items():
+            if found.failures:
+                line += f", FMC {found.fmc:.4f} at level {level_name(level)}"
+        lines.append(line)
         lines += version.summary.error_lines()
         lines += [f"  {late}" for late in late_errors(version.outcomes)]
     for version_change in compared.version_changes:
-        later = version_change.number
-        lines.append(f"from {later - 1} to {later}: {version_change_headline(version_change)}")
+        lines.append(version_change_headline(version_change))
         for group, changes in GROUPS.items():
             title = group
             for (change, before, after), number in version_change.transitions.items():
@@ -192,8 +175,6 @@ def comparison_lines(compared: Comparison) -> list[str]:
                 text.append(f"{change}{cut(len(changed), LISTED)}:")
             for case in changed[:LISTED]:
                 text.append(f"  case {case.later.index}: {change_in_words(case)}")
-    for level, row in fmc_rows(compared).items():
-        text.append(f"level {level_name(level)}: FMC {' -> '.join(row)}")
     return [*text, compared.source, *compared.notes]
 
 
