@@ -31,9 +31,9 @@ from merge_sumo.metrics.fmc import radius_for
 from merge_sumo.metrics.merge import meanings
 from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.metrics.plausibility import doubts
-from merge_sumo.reports.campaign_table import campaign_lines
+from merge_sumo.reports import facts
 from merge_sumo.reports.comparison_page import AGAINST_PAGE, write_against
-from merge_sumo.reports.facts import ERRORS, FAILURES, STARTS_THAT_FAIL, TIMEOUTS, by_level
+from merge_sumo.reports.facts import by_level
 from merge_sumo.reports.pages import page
 from merge_sumo.reports.report_data import page_data, pairs_of
 from merge_sumo.reports.report_model import INDEX, ReportModel
@@ -100,12 +100,11 @@ def report_page(model: ReportModel, *, running: bool = False) -> str:
         go_on=campaign_command("resume", run.folder, run.record),
         printed=end_of(run.folder / LOG),
         levels=by_level(model.facts),
-        headline=campaign_lines(run, model.summary, model.facts),
+        of={fact.name: fact for fact in model.facts if fact.level is None},
+        measure=campaign_command("probability", run.folder, run.record),
         kinds=Counter(model.kinds.values()).most_common(),
         # Constants of the sections.
-        starts_that_fail=STARTS_THAT_FAIL,
-        failures=FAILURES,
-        broken=(ERRORS, TIMEOUTS),
+        names=facts,
         kind_meanings=MEANINGS,
         references=list(REFERENCE_DRIVERS),
         braked_mps=BRAKED_MPS,
@@ -115,6 +114,7 @@ def report_page(model: ReportModel, *, running: bool = False) -> str:
         robustness=robustness,
         pairs_of=pairs_of,
         radius_for=radius_for,
+        log10=math.log10,
     )
 
 

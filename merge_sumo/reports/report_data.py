@@ -84,7 +84,7 @@ def page_data(model: ReportModel) -> dict[str, Any]:
         "speeds": speeds,
         "signals": {i: to_runs(t.signals) for i, t in model.motion.items() if t.signals},
         "why": _explanations(model),
-        "boxes": [{"level": box.level, "cases": box.indices} for box in model.boxes],
+        "regions": [{"level": one.level, "number": one.number} for one in model.described],
         "maps": {level: _map(model, level) for level in model.levels},
         "search": _search(model),
         **player_data(scenario, model.road),

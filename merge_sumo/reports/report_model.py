@@ -5,12 +5,13 @@ from __future__ import annotations
 from merge_sumo.analysis.comparison import compare_against
 from merge_sumo.analysis.counterfactuals import AVOIDANCE
 from merge_sumo.analysis.explanation import EXPLANATIONS
+from merge_sumo.analysis.share import SHARES
 from merge_sumo.analysis.stress import STRESS
 from merge_sumo.analysis.surface import Surface, learn_surface
 from merge_sumo.campaigns.printed_commands import campaign_command
 from merge_sumo.campaigns.recorded import RecordedCampaign, failures, regions_of, spread_failures
 from merge_sumo.metrics.cause import Diagnosis, Kind, diagnose
-from merge_sumo.metrics.failure_boxes import FailureBox, failure_boxes
+from merge_sumo.metrics.failure_regions import FailureRegion, failure_regions
 from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.metrics.summary import ErrorGroup, by_case, summarise
 from merge_sumo.reports.facts import facts_of
@@ -42,6 +43,7 @@ class ReportModel:
         surfaces: surrogate of each level; None without one.
         coordinates: coordinates of all levels.
         axes: coordinates of each level, in the pool's order.
+        shares: share of all starts that fail, and its interval, by level, each from 0 to 1.
         stress: result of the stress test; None without one.
         avoidance: drivers that avoid a failure, by its index.
         explanations: explanations of failures.
@@ -56,7 +58,7 @@ class ReportModel:
         motion: trajectories of the shown cases by index; lost ones are missing.
         diagnoses: conduct of VUT and POV by index; lost motions have none.
         kinds: kind of each failure that has one, by its index.
-        boxes: boxes of the pool where cases fail, by level.
+        described: regions of the pool where cases fail, in words, by level.
         explain: command that explains the case `INDEX`.
 
     Example:
@@ -86,6 +88,11 @@ class ReportModel:
                 self.surfaces[level] = learn_surface(run.outcomes, level, run.tolerated)
         self.coordinates = coordinates(run.scenario, self.levels or LEVELS)
         self.axes = {level: coordinates(run.scenario, (level,)) for level in self.levels}
+        self.shares: dict[int, tuple[float, float, float]] = {}
+        known = SHARES.read(run.folder)
+        for one in known.levels if known else ():
+            if one.without_verdict < one.cases:
+                self.shares[one.level] = (one.failures / one.cases, *one.interval)
         self.stress = STRESS.read(run.folder)
         self.avoidance = {one.index: one for one in AVOIDANCE.read_lines(run)}
         self.explanations = EXPLANATIONS.read_lines(run)
@@ -100,9 +107,9 @@ class ReportModel:
                 self.diagnoses[outcome.index] = found
                 if outcome.failed and found.kind is not None:
                     self.kinds[outcome.index] = found.kind
-        self.boxes: list[FailureBox] = []
+        self.described: list[FailureRegion] = []
         for level in self.levels:
-            self.boxes += failure_boxes(self.worst + self.near, level)
+            self.described += failure_regions(self.cases, level, self.regions)
         self.explain = campaign_command("explain", run.folder, run.record, INDEX)
 
     def _choose_cases(self) -> None:

@@ -7,8 +7,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from merge_sumo.campaigns.recorded import regions_of
 from merge_sumo.metrics.cause import Diagnosis, Kind, diagnose
-from merge_sumo.metrics.failure_boxes import failure_boxes
+from merge_sumo.metrics.failure_regions import failure_regions
 from merge_sumo.metrics.measures import Measures
 from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.road.scenario_file import named_scenario
@@ -123,20 +124,26 @@ def over_the_pool(fails, level: int = 1) -> list[Outcome]:
     return [outcome(n, x, v, fails(x, v), level) for n, (x, v) in enumerate(places)]
 
 
-class TestBoxes:
-    def test_of_a_band_of_equal_arrival_speak_of_the_time(self):
+class TestRegions:
+    def test_are_told_by_the_quantities_that_lie_close_together(self):
         outcomes = over_the_pool(lambda x, v: 8.3 < -x / v < 8.8)
-        (box,) = failure_boxes(outcomes, 1)
-        assert box.failures == sum(o.failed for o in outcomes)
-        assert box.where == "POV due at M (at constant speed) between 8.29 and 8.80 s"
-        inside = [o for o in outcomes if 8.29 <= -o.case.x_pov0_m / o.case.v_pov0_mps <= 8.8]
-        assert box.indices == tuple(o.index for o in inside)
+        (region,) = failure_regions(outcomes, 1, regions_of(outcomes))
+        # The first start due is (-220 m, 26.5 m/s), the last (-255 m, 29 m/s).
+        assert region.where == "POV due at M 8.30 to 8.79 s"
+        assert region.failures == region.cases == region.failing == sum(o.failed for o in outcomes)
 
-    def test_of_another_level_are_not_mixed_in(self):
-        outcomes = over_the_pool(lambda x, v: x > -200, level=2)
-        assert failure_boxes(outcomes, 1) == []
-        assert failure_boxes(outcomes, 2)[0].level == 2
+    def test_have_numbers_from_the_largest_and_are_not_those_of_another_level(self):
+        def fails(x, v):
+            return (x > -190 and v > 33) or (x < -330 and v < 26.6) or (x, v) == (-260, 30)
+
+        outcomes = over_the_pool(fails, level=2)
+        assert failure_regions(outcomes, 1, regions_of(outcomes)) == []
+        first, second = failure_regions(outcomes, 2, regions_of(outcomes))
+        assert (first.number, first.failures, second.number, second.failures) == (0, 8, 1, 8)
+        bounds = "x_POV0 -185 to -180 m, v_POV0 33.5 to 35.0 m/s"
+        assert second.where == f"POV due at M 5.14 to 5.52 s, {bounds}"
 
     def test_of_a_level_where_everything_fails_are_the_whole_pool(self):
-        (box,) = failure_boxes(over_the_pool(lambda x, v: True), 1)
-        assert (box.where, box.failures) == ("anywhere", box.cases)
+        outcomes = over_the_pool(lambda x, v: True)
+        (region,) = failure_regions(outcomes, 1, regions_of(outcomes))
+        assert (region.where, region.failures, region.cases) == ("anywhere", 693, 693)

@@ -130,6 +130,7 @@ def test_a_reader_goes_through_the_page_by_mouse_and_by_keys(browser, made):
         page.keyboard.press("ArrowUp")
         assert made.outcome(chosen(page)).case.v_pov0_mps > start.v_pov0_mps
         page.keyboard.press("Escape")
+        page.locator("#facts").click()
         page.locator("#about").click()
         assert page.locator("#chart-fmc .line").first.is_visible()
         page.emulate_media(media="print")
@@ -155,6 +156,18 @@ def test_a_comparison_has_one_player_and_does_not_grow_with_its_cases(browser, t
         assert str(chosen(page)) == buttons.first.inner_text()
 
 
+def test_the_first_screen_answers(browser, made):
+    options = {"viewport": {"width": 1400, "height": 900}}
+    with shown(browser, made.folder / report.REPORT, **options) as page:
+        box = "all => all.map((one) => one.getBoundingClientRect().toJSON())"
+        title, *maps, panel, road = page.locator("h1, .map > svg, #case, #road").evaluate_all(box)
+        assert title["top"] >= 0
+        assert [one["bottom"] < 860 and one["width"] > 300 for one in maps] == [True] * 3
+        assert panel["top"] < 500
+        assert road["bottom"] < 860
+        assert page.inner_text("#case-role") == "Worst case"
+
+
 def rows(page) -> list[int]:
     """Return the cases of the table of all cases, from top to bottom."""
     return [int(text) for text in page.locator("#table td button").all_inner_texts()]
@@ -169,8 +182,9 @@ def test_errors_and_timeouts_are_drawn_as_no_result_shown_first_and_grouped(brow
             "all => all.map((m) => m.dataset.case)"
         )
         assert sorted(map(int, drawn)) == [0, 3, 4, 6, 9, 11]
+        page.locator(".untested [data-case='4']").click()
         assert page.inner_text("#case-words").startswith("VUT_ERROR at ")
-        page.locator(".list [data-case='3']").click()
+        page.locator(".lists [data-case='3']").click()
         words = page.inner_text("#case-words")
         assert words.startswith("Timeout: the VUT ")
         assert "and the VUT did not reach the merge point in" in words

@@ -14,9 +14,10 @@ from support.calling import invoke
 from support.handmade import write_run
 
 from merge_sumo.analysis.counterfactuals import AVOIDANCE, Avoidance
+from merge_sumo.analysis.share import SHARES, LevelShare, Shares
 from merge_sumo.campaign_run import CampaignRun
 from merge_sumo.campaigns.recorded import RecordedCampaign, failures
-from merge_sumo.reports.facts import Fact
+from merge_sumo.reports.facts import CONTACT, Fact
 from merge_sumo.reports.report import report_page
 from merge_sumo.reports.report_model import ReportModel
 
@@ -28,6 +29,8 @@ def made(tmp_path_factory) -> RecordedCampaign:
     lines = [Avoidance(worst, ("careful", "rss"), 3.0, pov_careful=True)]
     lines += [Avoidance(index, (), None, pov_careful=False) for index in others]
     AVOIDANCE.write_lines(run.folder, lines)
+    shares = (LevelShare(0, 2000, 0), LevelShare(1, 2000, 22), LevelShare(2, 200, 0, 200))
+    SHARES.write(run.folder, Shares(shares))
     return run
 
 
@@ -72,7 +75,10 @@ def test_are_listed_once_each_with_a_key_and_a_file_of_the_folder(made, facts):
 
 
 def test_are_all_in_the_report_and_in_its_json(made, facts, page):
-    listed = {div[0].text: (div[0][0].text, div[1].text) for div in page.xpath("//dl/div")}
+    listed = {
+        div[0].text: (div[0][0].text, div[1].text)
+        for div in page.xpath("//div[@class='facts']/dl/div")
+    }
     of_all = {name: fact for (name, level), fact in facts.items() if level is None}
     assert of_all.keys() - listed.keys() == {"cases", "failures"}, "which are in the table"
     for name, shown in listed.items():
@@ -88,3 +94,25 @@ def test_are_all_in_the_report_and_in_its_json(made, facts, page):
     said = json.loads(invoke("report", made.folder, "--json").stdout)
     assert Path(said["report"]).is_file()
     assert [Fact(**row) for row in said["facts"]] == list(facts.values())
+
+
+def test_stand_on_the_first_screen(made):
+    model = ReportModel(made, learns=False)
+    model.facts = [*model.facts, Fact(CONTACT, 2, "severity")]
+    page: Any = html.fromstring(report_page(model))
+
+    def said(name: str) -> list[str]:
+        return [" ".join(one.text_content().split()) for one in page.find_class(name)]
+
+    rule = "A case fails with front bumpers within 6 m when the VUT reaches the merge point."
+    assert said("sentence") == [f"180 cases of us23 by the sampler uniform. {rule}"]
+    assert "2 more cases have a contact that this rule does not count" in said("strip")[0]
+    avoided = page.xpath("//div[@class='avoided']//dd/text()")
+    assert avoided == ["1", "0", "0", "1", "1"], "by careful, fsm, reg157, rss, and a careful POV"
+    none, some, unknown = said("map")
+    assert "< 0.15 % of all starts fail" in none
+    assert "1.1 % of all starts fail" in some
+    assert "95 % interval 0.69 to 1.7 %" in some
+    assert "of all starts" not in unknown
+    # The axis has 37 units for each power of ten, and 6 stands for 0.01 %.
+    assert page.xpath("//circle[@class='estimate']/@cx") == ["81.5"]

@@ -86,7 +86,7 @@ class TestThePage:
 
     def test_lists_the_worst_and_the_nearest_misses(self, made, page):
         root = root_of(page)
-        listed = [int(n) for n in root.xpath("//table//button/@data-case")]
+        listed = [int(n) for n in root.xpath("//section[@id='cases']//@data-case")]
         assert listed[0] == 179, "the case that ended with an error"
         assert listed[1:11] == [o.index for o in spread_failures(made.outcomes)[:10]]
         passing = [o for o in made.outcomes if o.margin is not None and not o.failed]
@@ -108,11 +108,11 @@ class TestWhatWasNotTested:
         root = root_of(broken)
         rows = root.xpath("//section[@aria-labelledby='untested']//tbody/tr")
         assert [[cell.text_content() for cell in row] for row in rows] == [
-            [f"{EVIL}\\x1b[31m", "VUT_ERROR", "2", "3"],
-            ["other", "VUT_ERROR", "1", "9"],
-            ["the VUT did not reach the merge point in 12 s", "TIMEOUT", "4", "0"],
+            [f"{EVIL}\\x1b[31m", "VUT_ERROR", "2 cases", "first 3"],
+            ["other", "VUT_ERROR", "1 case", "first 9"],
+            ["the VUT did not reach the merge point in 12 s", "TIMEOUT", "4 cases", "first 0"],
         ]
-        assert broken.index('id="untested"') < broken.index('id="facts"')
+        assert broken.index('id="untested"') < broken.index('class="total"')
 
     def test_ends_with_what_the_controller_printed_last(self, tmp_path):
         run = write_run(tmp_path / "run", 10, errors={})

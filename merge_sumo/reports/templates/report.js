@@ -75,20 +75,20 @@ function shade(svg, values, nx, ny, box, clip) {
 }
 
 /* ---------- maps ---------- */
-const BOX = [52, 8, 334, 286]; // x, y, width, height of the plot in a map
+const BOX = [44, 6, 350, 184]; // x, y, width, height of the plot in a map
 const unit = (c, value) => (value - c.low) / (c.high - c.low);
 let chosen = -1;
 const maps = [...document.querySelectorAll(".map")].map((figure) => new FailureMap(figure));
 
 function FailureMap(figure) {
-  const svg = figure.querySelector("svg"), level = Number(figure.dataset.level), of = data.maps[level];
+  const svg = figure.querySelector(":scope > svg"), level = Number(figure.dataset.level), of = data.maps[level];
   const [left, top, width, height] = BOX;
   const X = (u) => left + u * width, Y = (v) => top + (1 - v) * height; // of shares of the pool
   const own = cases.index.map((_, i) => i).filter((i) => cases.level[i] === level);
   const third = of.through === null ? null : coordinates[of.through]; // the reader moves through it
   const slider = figure.querySelector("input[type=range]"), check = figure.querySelector("input[type=checkbox]");
   const pairs = figure.querySelector("select");
-  let pair = 0, at = 0, all = third === null, axes = [], marks = [];
+  let pair = 0, at = 0, all = true, axes = [], marks = [];
   const apart = (i) => (all ? 0 : Math.abs(cases[third.field][i] - at));
   const near = (i) => all || apart(i) <= third.near;
 
@@ -136,20 +136,33 @@ function FailureMap(figure) {
       drawMark(svg, i, x, y, faint);
       drawShare(svg, i, x, y, faint);
     }
+    numbers();
     this.choose();
   };
   this.move = (value, everything) => {
     at = value; all = everything;
     slider.value = value;
-    slider.disabled = all;
     check.checked = all;
     const degrees = third.unit === "rad" ? ` (${Math.round(value * 180 / Math.PI)}°)` : "";
     figure.querySelector("output").textContent = all ? "all values" : valueText(third, value) + degrees;
     this.draw();
   };
   this.showAll = () => (third ? this.move(at, true) : this.draw());
-  this.begin = () => (third ? this.move(at, false) : this.draw());
   this.lookAt = (i) => { if (cases.level[i] === level && !near(i)) this.move(cases[third.field][i], false); };
+  const numbers = () => { // of the regions that the list describes, each at its case next to their middle
+    const taken = [];
+    for (const region of data.regions) {
+      const inside = region.level === level ? marks.filter(({ i }) => cases.region[i] === region.number && near(i) && wanted(i)) : [];
+      if (!inside.length) continue;
+      const middle = (key) => inside.reduce((sum, mark) => sum + mark[key], 0) / inside.length, [x, y] = [middle("x"), middle("y")];
+      const off = (mark) => Math.hypot(mark.x - x, mark.y - y);
+      const at = inside.reduce((best, mark) => (off(mark) < off(best) ? mark : best));
+      const side = at.x > left + width - 24 ? -1 : 1, spot = { x: at.x + side * 10, y: clamp(at.y + 4, top + 11, top + height - 3) };
+      if (taken.some(({ x, y }) => Math.abs(x - spot.x) < 12 && Math.abs(y - spot.y) < 11)) continue; // a slice, or a click in the list, shows it
+      taken.push(spot);
+      draw(svg, "text", { class: "named number", x: spot.x, y: spot.y, "text-anchor": side < 0 ? "end" : "start" }, String(region.number + 1));
+    }
+  };
   const counts = () => { // of a long campaign: the cases that are not listed one by one
     const grid = of.grids[pair].counts;
     if (!grid) return;
@@ -225,9 +238,8 @@ function ticks(step) {
 
 /* ---------- a case: road, motion, charts ---------- */
 const panel = byId("case");
-function dock(on) { // at the foot of the window, or in its place next to the lists
+function dock(on) { // at the foot of the window, or in its place next to the maps
   panel.classList.toggle("docked", on);
-  byId("explorer").classList.toggle("docked", on);
   byId("close").hidden = !on;
   if (moving) at(step);
 }
@@ -246,7 +258,7 @@ function openCase(i, element = null) { // asked for by the reader: it is in sigh
 }
 
 /* ---------- the address: #case-111&verdict=failure ---------- */
-const form = byId("filters"), FILTERS = ["box", "level", "verdict", "severity", "region", "kind", "avoided", "measure", "from", "to"];
+const form = byId("filters"), FILTERS = ["level", "verdict", "severity", "region", "kind", "avoided", "measure", "from", "to"];
 let opened = -1; // the case that the reader asked for
 function filtersSet() { // [name, value] of what is not as it was
   const bounded = form.elements.from.value !== "" || form.elements.to.value !== "";
@@ -274,6 +286,10 @@ function restore() { // an address is data: what it names that is not here is le
 }
 addEventListener("hashchange", () => { restore(); filter(); openLinked(); });
 addEventListener("keydown", (event) => { if (event.key === "Escape") dock(false); });
+addEventListener("scroll", () => { // back where its place is in sight
+  const { top } = byId("case-place").getBoundingClientRect();
+  if (panel.classList.contains("docked") && top >= 0 && top + 380 <= innerHeight) dock(false);
+}, { passive: true });
 byId("close").addEventListener("click", () => dock(false));
 
 function show(i) {
@@ -290,8 +306,10 @@ function show(i) {
   for (const button of document.querySelectorAll("[data-case]")) {
     button.closest("tr")?.classList.toggle("on", Number(button.dataset.case) === cases.index[i]);
   }
+  byId("case-role").textContent = cases.index[i] !== Number(panel.dataset.first) ? verdict(i) : failed(i) ? `worst case${undecided(i) ? ", undecided" : ""}` : tested(i) ? "no failure, but the nearest to one" : verdict(i);
   moving = motion(i);
   byId("case-motion").hidden = moving === null;
+  byId("why").hidden = !failed(i) || moving === null;
   play(false);
   if (moving) showMotion(i);
 }
@@ -304,7 +322,6 @@ function showMotion(i) {
 }
 function whyCharts(i) { // why it failed: until when something could be done, and with which changes it passes
   const found = data.why[cases.index[i]];
-  byId("why").hidden = !failed(i);
   byId("why-known").hidden = !found;
   byId("why-ask").hidden = Boolean(found);
   if (!found) return [];
@@ -407,7 +424,7 @@ for (const table of document.querySelectorAll(".list")) {
 const verdict = (i) => (undecided(i) ? "undecided" : failed(i) ? "failure" : tested(i) ? "no failure" : cases.end[i]);
 function allCases() { // gives what shows the cases that the filters let through
   const head = byId("table").tHead.rows[0], body = byId("table").tBodies[0], more = byId("more");
-  const { box, level, severity: severe, verdict: ended, region, kind, measure, from, to } = form.elements, avoided = form.elements.avoided; // null where that is not known
+  const { level, severity: severe, verdict: ended, region, kind, measure, from, to } = form.elements, avoided = form.elements.avoided; // null where that is not known
   const number = (key, name, digits) => ({ name, exact: true, value: (i) => cases[key][i], text: (value) => fixed(value, digits) });
   const kindOf = (i) => cases.kind[i];
   const columns = [
@@ -446,9 +463,6 @@ function allCases() { // gives what shows the cases that the filters let through
   const severities = count(severity);
   for (const value of data.severities) if (severities.has(value)) option(severe, value, `${value} (${severities.get(value)})`);
   for (const c of columns) if (c.exact && c.name !== "case") option(measure, c.name);
-  for (const [n, { level: l, cases: inside }] of data.boxes.entries()) option(box, n, `level ${data.level_names[l]}, ${n + 1} (${inside.length})`);
-  box.parentElement.hidden = !data.boxes.length;
-  const boxes = data.boxes.map(({ cases: inside }) => new Set(inside));
 
   for (const c of columns) {
     const cell = head.appendChild(document.createElement("th")), button = cell.appendChild(document.createElement("button"));
@@ -477,15 +491,14 @@ function allCases() { // gives what shows the cases that the filters let through
   const filter = () => {
     const low = from.value === "" ? -Infinity : Number(from.value), high = to.value === "" ? Infinity : Number(to.value);
     const measured = columns.find(({ name }) => name === measure.value)?.value, bounded = measured && (low > -Infinity || high < Infinity);
-    const inside = box.value === "" ? null : boxes[box.value];
     found = all.filter((i) => (!level.value || cases.level[i] === Number(level.value))
       && (!ended.value || verdict(i) === ended.value || `: ${message(i)}` === ended.value)
       && (!severe.value || severity(i) === severe.value) && (!region.value || where(i) === region.value) && (!kind.value || kindOf(i) === kind.value)
-      && (!avoided?.value || avoidedBy(i, avoided.value)) && (!inside || inside.has(cases.index[i]))
+      && (!avoided?.value || avoidedBy(i, avoided.value))
       && (!bounded || (measured(i) !== null && measured(i) >= low && measured(i) <= high)));
     matching = filtersSet().length ? new Set(found) : null;
     list();
-    for (const map of maps) inside && map.level === data.boxes[box.value].level ? map.showAll() : map.draw();
+    for (const map of maps) region.value.startsWith(`${map.level}:`) ? map.showAll() : map.draw();
     for (const button of document.querySelectorAll("[data-filter]")) button.setAttribute("aria-pressed", form.elements[button.dataset.filter].value === button.dataset.value);
     byId("filtered").hidden = matching === null;
     byId("filtered-number").textContent = `${found.length} of ${all.length} cases are let through by the filters; the others are faint.`;
@@ -544,10 +557,9 @@ function search() {
   plot(byId("chart-fmc"), { xRange: [0, numbers[numbers.length - 1]], xLabel: "cases", yRange: [0, 1.1 * most], lines });
 }
 
-const worst = document.querySelector(".list button");
 const filter = allCases();
 restore();
-for (const map of maps) map.begin();
+for (const map of maps) map.showAll();
 search();
 if (cases.index.length) filter();
-if (!openLinked() && worst) show(place.get(Number(worst.dataset.case)));
+if (!openLinked() && panel.dataset.first) show(place.get(Number(panel.dataset.first)));
