@@ -345,9 +345,9 @@ def main() -> None:
     for name in options.names or MAKERS:
         lines = difference(name)
         stale |= bool(lines)
-        if lines:
+        if lines and options.check:
             print(f"{name} is not of today's tool:", *lines[:LINES_SHOWN], sep="\n", flush=True)
-        if not options.check and (lines or options.names):
+        elif lines or (options.names and not options.check):
             make(name)
             print(f"{name} is made", flush=True)
     sys.exit(int(options.check and stale))
