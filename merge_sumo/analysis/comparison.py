@@ -30,8 +30,6 @@ from merge_sumo.scenario.case import Case
 from merge_sumo.scenario.scenario import level_name
 from merge_sumo.scenario.trajectory import Trajectory
 
-LISTED = 10
-"""Maximum number of cases of each kind that lines name."""
 SIGNIFICANT = 0.05
 """Largest p-value of Fisher's exact test at which a difference is more than chance."""
 
@@ -95,30 +93,33 @@ class Change(StrEnum):
 
     BROKE = "broke"
     WORSE = "worse but passing"
+    FIXED = "fixed"
     WEAKER = "weaker"
     ACCEPTED = "accepted"
     WITHIN_CHANCE = "within chance"
     NOT_REPEATABLE = "not repeatable"
-    NEITHER = "pass with neither"
     STILL_CONTACT = "contact without failure"
-    FIXED = "fixed"
+    NEITHER = "pass with neither"
     BOTH = "pass with both"
 
+    @property
+    def group(self) -> str:
+        """Its meaning for the later version; a case that is worse gives exit code 1."""
+        return GROUP[self]
 
-GROUPS = {
-    "worse": (Change.BROKE, Change.WORSE),
-    "better": (Change.FIXED,),
-    "weaker": (Change.WEAKER,),
-    "not counted": (
-        Change.ACCEPTED,
-        Change.WITHIN_CHANCE,
-        Change.NOT_REPEATABLE,
-        Change.STILL_CONTACT,
-    ),
-    "same verdict": (Change.NEITHER, Change.BOTH),
+
+GROUP = {
+    Change.BROKE: "worse",
+    Change.WORSE: "worse",
+    Change.FIXED: "better",
+    Change.WEAKER: "weaker",
+    Change.ACCEPTED: "not counted",
+    Change.WITHIN_CHANCE: "not counted",
+    Change.NOT_REPEATABLE: "not counted",
+    Change.STILL_CONTACT: "not counted",
+    Change.NEITHER: "same verdict",
+    Change.BOTH: "same verdict",
 }
-"""The changes by what they mean for the later version; a case that is worse gives exit code 1."""
-GOT_WORSE = GROUPS["worse"]
 
 
 def outcome_word(outcome: Outcome) -> str:
@@ -265,13 +266,20 @@ class VersionChange:
             found[one.change, outcome_word(one.earlier), outcome_word(one.later)] += 1
         return found
 
-    def count(self, *changes: Change) -> int:
-        """Return the number of cases with one of some changes.
+    @property
+    def groups(self) -> Counter[str]:
+        """Number of cases of each group; worse and better also where there are none."""
+        found = Counter({"worse": 0, "better": 0})
+        found.update(one.change.group for one in self.cases)
+        return found
+
+    def count(self, change: Change) -> int:
+        """Return the number of cases with a change.
 
         Args:
-            changes: the changes.
+            change: the change.
         """
-        return sum(case.change in changes for case in self.cases)
+        return sum(case.change is change for case in self.cases)
 
     def to_record(self) -> dict[str, Any]:
         """Return the changes as JSON has them, without the cases that pass with both versions."""
@@ -325,7 +333,7 @@ class Comparison(Result):
     def worse(self) -> bool:
         """Whether a case got worse, a version passes less often, or the last one tested no case."""
         for one in self.version_changes:
-            if one.passes_less or one.count(*GOT_WORSE):
+            if one.passes_less or one.groups["worse"]:
                 return True
         return not any(outcome.is_tested for outcome in self.versions[-1].outcomes)
 

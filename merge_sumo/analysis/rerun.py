@@ -7,7 +7,6 @@ from dataclasses import replace
 
 from merge_sumo.analysis.cases_file import CasesFile
 from merge_sumo.analysis.comparison import (
-    GOT_WORSE,
     Change,
     ComparedCase,
     Comparison,
@@ -31,7 +30,7 @@ from merge_sumo.scenario.scenario import AnyLevels, level_name, names_of_levels
 from merge_sumo.scenario.trajectory import Trajectory
 from merge_sumo.simulation.evaluate import open_simulators, with_measures
 
-AGAIN = (*GOT_WORSE, Change.WEAKER, Change.STILL_CONTACT, Change.FIXED)
+AGAIN = (Change.BROKE, Change.WORSE, Change.WEAKER, Change.STILL_CONTACT, Change.FIXED)
 """Changes of which the case runs once more, where its controller may not repeat itself."""
 
 

@@ -19,7 +19,7 @@ from merge_sumo.analysis.cases_file import (
     short,
     verdict_of,
 )
-from merge_sumo.analysis.comparison import GOT_WORSE, Change, Comparison
+from merge_sumo.analysis.comparison import Change, Comparison
 from merge_sumo.campaigns.recorded import RecordedCampaign, spread_failures
 from merge_sumo.errors import notice
 from merge_sumo.files import check_new, make_folder, write_new
@@ -61,7 +61,7 @@ def with_file(compared: Comparison, file: CasesFile, path: Path) -> Comparison:
     for one in version_change.cases:
         index = one.later.index
         reason = file.accepted.get(index)
-        if one.change in GOT_WORSE:
+        if one.change.group == "worse":
             why = cause(one.later, now.motion(index))
             notes.append(f"case {index}, {one.change}: {why}")
         elif one.change is Change.WEAKER:

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 from merge_sumo.analysis.comparison import (
-    GROUPS,
     Change,
     ComparedCase,
     Comparison,
@@ -26,15 +25,6 @@ from merge_sumo.scenario.scenario import level_name
 
 SHOWN = 2000
 """Maximum number of cases of a page that are listed, with both motions."""
-LISTED = (
-    Change.BROKE,
-    Change.FIXED,
-    Change.WITHIN_CHANCE,
-    Change.NOT_REPEATABLE,
-    Change.STILL_CONTACT,
-    Change.NEITHER,
-)
-"""Changes whose cases are listed; the template explains them."""
 PAGE = ".html"
 """Ending of a page; a browser shows a file with another ending as source."""
 AGAINST_PAGE = f"{AGAINST}{PAGE}"
@@ -64,7 +54,9 @@ def comparison_page(compared: Comparison) -> str:
     shown: list[tuple[VersionChange, ComparedCase]] = []
     lists = []
     for version_change in compared.version_changes:
-        for change in LISTED:
+        for change in Change:
+            if change is Change.BOTH:
+                continue
             cases = [one for one in version_change.cases if one.change is change]
             first, cases_shown = len(shown), cases[: SHOWN - len(shown)]
             shown += [(version_change, one) for one in cases_shown]
@@ -73,10 +65,9 @@ def comparison_page(compared: Comparison) -> str:
                 lists.append((version_change, change, len(cases), rows))
     return page(
         "comparison.html.jinja",
-        styles=("report.css", "comparison.css"),
+        styles=("report.css", "tally.css", "comparison.css"),
         scripts=("player.js", "comparison.js") if shown else (),
         compared=compared,
-        groups=GROUPS,
         headline=comparison_headline(compared),
         change_in_words=change_in_words,
         lists=lists,

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from merge_sumo.analysis.comparison import GOT_WORSE, Change, Comparison, VersionChange
+from merge_sumo.analysis.comparison import Change, Comparison, VersionChange
 from merge_sumo.campaign_run import CampaignRun
 from merge_sumo.campaigns.recorded import NAME_CHARACTERS, RecordedCampaign
 from merge_sumo.files import check_new, write_new
@@ -152,7 +152,7 @@ def _tests(version_change: VersionChange, *, every: bool = False) -> list[TestCa
             continue
         name = f"case {one.later.index}: {described(one.later.case)}"
         test = TestCase(name, "against", one.later.measures.t_end_s)
-        if one.change in GOT_WORSE:
+        if one.change.group == "worse":
             test.tag, test.kind, test.message = "failure", REGRESSION, change_in_words(one)
         elif one.change in (Change.ACCEPTED, Change.NOT_REPEATABLE):
             test.tag, test.message = "skipped", f"{one.change}: {change_in_words(one)}"

@@ -87,7 +87,7 @@ def report_page(model: ReportModel, *, running: bool = False) -> str:
     data = msgspec.json.encode(page_data(model)).decode().replace("<", "\\u003c")
     return page(
         "report.html.jinja",
-        styles=("report.css",),
+        styles=("report.css", "tally.css"),
         scripts=("player.js", "report.js"),
         every_s=REPORT_EVERY_S if running else 0,
         now=f"{datetime.now().astimezone():%H:%M:%S}",

@@ -10,8 +10,6 @@ from collections.abc import Iterator, Sequence
 
 from merge_sumo.analysis.cases_file import short
 from merge_sumo.analysis.comparison import (
-    GROUPS,
-    LISTED,
     Change,
     ComparedCase,
     Comparison,
@@ -41,13 +39,8 @@ from merge_sumo.scenario.case import Case, coordinates, described
 from merge_sumo.scenario.scenario import DT_S, VEHICLES, level_name
 from merge_sumo.scenario.trajectory import Trajectory
 
-CHANGES_LISTED = (
-    Change.BROKE,
-    Change.WITHIN_CHANCE,
-    Change.NOT_REPEATABLE,
-    Change.STILL_CONTACT,
-)
-"""Changes whose cases a terminal lists."""
+LISTED = 10
+"""Maximum number of cases of each kind that lines name."""
 
 
 def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
@@ -107,11 +100,7 @@ def version_change_headline(version_change: VersionChange) -> str:
         by = f"by Fisher's exact test p = {version_change.p_value:.2g}"
         parts.append(f"{later} passes less often than {later - 1}, {by}")
     if version_change.cases:
-        numbers = []
-        for group, changes in GROUPS.items():
-            number = version_change.count(*changes)
-            if number or group in ("worse", "better"):
-                numbers.append(f"{number} {group}")
+        numbers = [f"{number} {group}" for group, number in version_change.groups.items()]
         parts.append(f"of {counted(len(version_change.cases), 'shared case')} {', '.join(numbers)}")
     else:
         parts.append("no case is shared")
@@ -149,12 +138,8 @@ def comparison_summary(compared: Comparison) -> list[str]:
         lines += [f"  {late}" for late in late_errors(version.outcomes)]
     for version_change in compared.version_changes:
         lines.append(version_change_headline(version_change))
-        for group, changes in GROUPS.items():
-            title = group
-            for (change, before, after), number in version_change.transitions.items():
-                if change in changes:
-                    lines.append(f"  {title:<12}{number:6d}  {before} -> {after} ({change})")
-                    title = ""
+        for (change, before, after), number in version_change.transitions.items():
+            lines.append(f"  {change.group:<12}{number:6d}  {before} -> {after} ({change})")
     return lines
 
 
@@ -169,12 +154,12 @@ def comparison_lines(compared: Comparison) -> list[str]:
     if compared.text is not None:
         return [*text, *compared.notes]
     for version_change in compared.version_changes:
-        for change in CHANGES_LISTED:
+        for change in Change:
             changed = [case for case in version_change.cases if case.change is change]
-            if changed:
+            if changed and change.group in ("worse", "not counted"):
                 text.append(f"{change}{cut(len(changed), LISTED)}:")
-            for case in changed[:LISTED]:
-                text.append(f"  case {case.later.index}: {change_in_words(case)}")
+                for case in changed[:LISTED]:
+                    text.append(f"  case {case.later.index}: {change_in_words(case)}")
     return [*text, compared.source, *compared.notes]
 
 

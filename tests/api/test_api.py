@@ -89,20 +89,16 @@ def test_a_wrong_value_is_one_sentence_and_leaves_nothing(
 
 
 @pytest.mark.parametrize(
-    ("call", "sentence"),
+    ("verb", "keyword", "sentence"),
     [
-        (
-            lambda: ms.probability("run", level=1),  # type: ignore[call-arg]
-            "benchmark, campaign, rerun, resume, run or truth has: choose run, ",
-        ),
-        (lambda: ms.campaign("design2", casse=3), "no keyword `casse`: did you mean "),  # type: ignore[call-arg]
-        (lambda: ms.scenarios(vut="a"), ", campaign, "),  # type: ignore[call-arg]
-        (lambda: ms.open_run("a", xyz=1), "`xyz`: choose folder"),  # type: ignore[call-arg]
+        ("probability", "level", "campaign, rerun, resume, run or truth has: choose run, "),
+        ("campaign", "casse", "campaign has no keyword `casse`: did you mean "),
+        ("open_run", "xyz", "`xyz`: choose folder"),
     ],
 )
-def test_a_keyword_of_another_function_is_refused_with_the_functions_that_have_it(call, sentence):
+def test_a_keyword_of_another_function_is_refused_with_who_has_it(verb, keyword, sentence):
     with pytest.raises(UserError) as refused:
-        call()
+        getattr(ms, verb)("run", **{keyword: 1})
     assert sentence in str(refused.value)
 
 
