@@ -166,6 +166,11 @@ def test_the_first_screen_answers(browser, made):
         assert panel["top"] < 500
         assert road["bottom"] < 860
         assert page.inner_text("#case-role") == "Worst case"
+        region = page.locator(".regions tbody tr").first
+        level, number, _, found, _ = region.locator("td").all_inner_texts()
+        region.locator("button").click()
+        assert page.locator(f".map[data-level='{level}'] text.number").text_content() == number
+        assert page.inner_text("#filtered-number").split()[0] == found
 
 
 def rows(page) -> list[int]:

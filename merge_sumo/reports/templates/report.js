@@ -286,6 +286,7 @@ function restore() { // an address is data: what it names that is not here is le
 }
 addEventListener("hashchange", () => { restore(); filter(); openLinked(); });
 addEventListener("keydown", (event) => { if (event.key === "Escape") dock(false); });
+addEventListener("beforeprint", () => { byId("facts").closest("details").open = true; });
 addEventListener("scroll", () => { // back where its place is in sight
   const { top } = byId("case-place").getBoundingClientRect();
   if (panel.classList.contains("docked") && top >= 0 && top + 380 <= innerHeight) dock(false);
