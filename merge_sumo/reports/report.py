@@ -37,7 +37,7 @@ from merge_sumo.reports.facts import by_level
 from merge_sumo.reports.pages import page
 from merge_sumo.reports.report_data import page_data, pairs_of
 from merge_sumo.reports.report_model import INDEX, ReportModel
-from merge_sumo.reports.text import comparison_headline, robustness
+from merge_sumo.reports.text import robustness
 
 REPORT = "report.html"
 FIRST_REPORT_S = 2.0
@@ -110,7 +110,6 @@ def report_page(model: ReportModel, *, running: bool = False) -> str:
         braked_mps=BRAKED_MPS,
         # Functions that the sections call.
         meanings=meanings,
-        comparison_headline=comparison_headline,
         robustness=robustness,
         pairs_of=pairs_of,
         radius_for=radius_for,
