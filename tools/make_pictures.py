@@ -22,7 +22,7 @@ import sys
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Final
 
@@ -81,6 +81,15 @@ Maker = Callable[[Path | None], str]
 """Return the text of today's picture; where a new file is given, also write the picture there."""
 
 
+@cache
+def campaign() -> tempfile.TemporaryDirectory[str]:
+    """Run a campaign, once, and return its working folder, which lasts as long as this process."""
+    folder = tempfile.TemporaryDirectory()
+    command = [sys.executable, "-m", "merge_sumo.cli", "campaign", *CAMPAIGN]
+    subprocess.run(command, cwd=folder.name, check=True, capture_output=True)
+    return folder
+
+
 @contextmanager
 def browser_page() -> Iterator[Page]:
     """Yield a page of Chromium without a window."""
@@ -94,15 +103,13 @@ def browser_page() -> Iterator[Page]:
 
 
 def report_picture(new: Path | None) -> str:
-    """Run a campaign, and show the first screen of its report.
+    """Show the first screen of the report of a campaign.
 
     Args:
         new: new file; None for the text alone.
     """
-    with tempfile.TemporaryDirectory() as folder, browser_page() as page:
-        command = [sys.executable, "-m", "merge_sumo.cli", "campaign", *CAMPAIGN]
-        subprocess.run(command, cwd=folder, check=True, capture_output=True)
-        page.goto((Path(folder) / "design2" / REPORT).as_uri())
+    with browser_page() as page:
+        page.goto((Path(campaign().name) / "design2" / REPORT).as_uri())
         text = str(page.evaluate(TEXT_OF_THE_FIRST_SCREEN))
         if new:
             page.screenshot(path=new)
@@ -343,13 +350,15 @@ def main() -> None:
         parser.error(f"{min(unknown)} is none of {', '.join(MAKERS)}")
     stale = False
     for name in options.names or MAKERS:
-        lines = difference(name)
-        stale |= bool(lines)
-        if lines and options.check:
-            print(f"{name} is not of today's tool:", *lines[:LINES_SHOWN], sep="\n", flush=True)
-        elif lines or (options.names and not options.check):
+        if options.names and not options.check:
             make(name)
-            print(f"{name} is made", flush=True)
+        elif lines := difference(name):
+            stale = True
+            if options.check:
+                print(f"{name} is not of today's tool:", *lines[:LINES_SHOWN], sep="\n", flush=True)
+            else:
+                make(name)
+                print(f"{name} is made", flush=True)
     sys.exit(int(options.check and stale))
 
 
