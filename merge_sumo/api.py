@@ -3,7 +3,7 @@
 import merge_sumo as ms
 
 run = ms.campaign("design2", cases=400, seed=1)
-run.failures        # rows for pandas.DataFrame(run.failures)
+run.to_dataframe()  # of pandas
 run.report()        # path of the HTML report
 
 A VUT is a spec, as after `--vut`, or a class, a function, or an object with `act` or `act_batch`.
@@ -444,7 +444,7 @@ def reproduce(config: c.Reproduce) -> reproduction.Reproduction:
     """Reproduce Table II and the figures of the paper."""
     scale = reproduction.scale_of(config)
     policies, folder = policies_folder(config.policies, US23), path_of(config.out)
-    figures.require_matplotlib()
+    figures.require("matplotlib")
     folder = folder or dated("reproduce")
     with open_workers(config.workers) as workers, Bars(shown=config.progress) as bars:
         make_folder(folder)

@@ -5,14 +5,15 @@ from __future__ import annotations
 from collections.abc import Iterable
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from merge_sumo.analysis.cases_file import CasesFile
+from merge_sumo.analysis.cases_file import CasesFile, verdict_of
 from merge_sumo.analysis.comparison import Change, Comparison, compare_against
 from merge_sumo.analysis.share import SHARES
 from merge_sumo.campaigns.recorded import AGAINST, RecordedCampaign, failures
 from merge_sumo.campaigns.repeatability import SecondRun, read_second_runs, unrepeatable
 from merge_sumo.config import AnyRun
+from merge_sumo.errors import UserError
 from merge_sumo.metrics.cause import cause
 from merge_sumo.metrics.measures import Measures
 from merge_sumo.metrics.outcome import Episode, Outcome
@@ -27,10 +28,15 @@ from merge_sumo.records import to_plain
 from merge_sumo.reports.campaign_table import campaign_lines, labelled
 from merge_sumo.reports.comparison_page import AGAINST_PAGE
 from merge_sumo.reports.facts import Fact, facts_of
+from merge_sumo.reports.figures import draw_case, draw_map, maps_picture, require
 from merge_sumo.reports.text import comparison_summary, episode_lines
 from merge_sumo.result import Result
 from merge_sumo.road.scenario_file import SUFFIX
 from merge_sumo.scenario.trajectory import End, Trajectory
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from pandas import DataFrame
 
 Rows = list[dict[str, Any]]
 """Cases as in `outcomes.jsonl`, which `pandas.DataFrame` takes as they are."""
@@ -68,6 +74,11 @@ class CampaignRun(Result):
     def settings(self) -> dict[str, Any]:
         """Content of `campaign.json`."""
         return self.recorded.record
+
+    @property
+    def outcomes(self) -> list[Outcome]:
+        """All outcomes, in the order of their index."""
+        return self.recorded.outcomes
 
     @property
     def cases(self) -> Rows:
@@ -144,6 +155,56 @@ class CampaignRun(Result):
             UserError: the campaign has no such case, or its motion cannot be read.
         """
         return self.recorded.trajectory(index)
+
+    def to_dataframe(self) -> DataFrame:
+        """Return the cases as a pandas data frame, with their margins and verdicts.
+
+        Raises:
+            UserError: pandas is not installed.
+
+        Example:
+            >>> run.to_dataframe().groupby("level").verdict.value_counts()
+        """
+        frame = require("pandas", "notebook").json_normalize(self.cases)
+        frame["margin"] = [outcome.margin for outcome in self.outcomes]
+        frame["verdict"] = [verdict_of(outcome) for outcome in self.outcomes]
+        return frame
+
+    def plot_map(self, level: int, axes: Axes | None = None) -> Axes:
+        """Draw the starts of the cases of a POV level, and return the axes.
+
+        Args:
+            level: level of the POV.
+            axes: axes of matplotlib to draw into; None for a new figure.
+
+        Raises:
+            UserError: the campaign has no such level, or matplotlib is not installed.
+        """
+        if level not in self.recorded.levels:
+            raise UserError(f"no level {level!r} in {self.folder}: it has {self.recorded.levels}")
+        at_level = [one for one in self.recorded.cases if one.case.level == level]
+        return draw_map(at_level, self.recorded.scenario.dimensions(level), axes)
+
+    def plot_case(self, index: int, axes: Axes | None = None) -> Axes:
+        """Draw the positions of all cars of a case over time, and return the axes.
+
+        Args:
+            index: index of the case.
+            axes: axes of matplotlib to draw into; None for a new figure.
+
+        Raises:
+            UserError: the campaign has no such case, or matplotlib is not installed.
+        """
+        title = f"case {index}: {self.recorded.outcome(index).measures.result}"
+        return draw_case(self.trajectory(index), title, axes)
+
+    def _repr_html_(self) -> str:
+        """Return the lines, and the maps of all levels side by side."""
+        try:
+            maps = maps_picture(self.plot_map, self.recorded.levels)
+        except UserError as error:
+            maps = f"<p>{error}</p>"
+        return super()._repr_html_() + maps
 
     @property
     def report_file(self) -> Path:

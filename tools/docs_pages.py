@@ -22,6 +22,7 @@ SHOWN = (
 )
 """Pages of other folders than docs/, next to their subject."""
 PICTURES = "scenarios/**/*.png"
+NOTEBOOKS = "tutorials/*.ipynb"
 
 
 EXIT_CODES: Final = """# Commands
@@ -120,7 +121,7 @@ TABLE: Final = re.compile(r"<!-- table: ([\w ]+) -->")
 
 
 def on_files(files: Any, config: Any) -> Any:
-    """Add pages and pictures from other folders to the site; MkDocs calls this.
+    """Add pages and pictures from other folders, and notebooks, to the site; MkDocs calls this.
 
     Args:
         files: files of the site.
@@ -133,7 +134,27 @@ def on_files(files: Any, config: Any) -> Any:
 
     for path in (*SHOWN, *(p.relative_to(ROOT).as_posix() for p in ROOT.glob(PICTURES))):
         files.append(File.generated(config, path, abs_src_path=str(ROOT / path)))
+    for notebook in DOCS.glob(NOTEBOOKS):
+        for name, content in pages_of_notebook(notebook).items():
+            files.append(File.generated(config, name, content=content))
     return files
+
+
+def pages_of_notebook(path: Path) -> dict[str, str | bytes]:
+    """Return an executed notebook as a page, and its pictures, by their paths on the site.
+
+    Args:
+        path: the notebook in docs/.
+    """
+    from nbconvert import MarkdownExporter
+
+    exporter: Any = MarkdownExporter  # without types
+    text, found = exporter().from_filename(str(path))
+    place = path.relative_to(DOCS)
+    made: dict[str, str | bytes] = {place.with_suffix(".md").as_posix(): text}
+    for name, picture in found["outputs"].items():
+        made[(place.parent / name).as_posix()] = picture
+    return made
 
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:

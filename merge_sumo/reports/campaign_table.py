@@ -19,21 +19,18 @@ from merge_sumo.reports.facts import (
     DRIVEN,
     ERRORS,
     FAILURES,
-    FMC,
     KIND,
     PROBABILITY_TO_FAIL,
-    REGIONS,
     REPEATED,
     RULE,
     STARTS_THAT_FAIL,
     TIMEOUTS,
     UNDECIDED,
     VUT,
-    WITHOUT_VERDICT,
     WORST,
     Fact,
-    by_level,
 )
+from merge_sumo.reports.text import aligned
 from merge_sumo.scenario.scenario import level_name
 
 LINE_CHARACTERS = 105
@@ -49,8 +46,6 @@ COLUMNS = (
     "regions",
     "FMC",
 )
-LEFT = COLUMNS[:2]
-"""Left-aligned columns."""
 SMALL_FMC = 0.001
 
 
@@ -82,11 +77,10 @@ def campaign_lines(run: RecordedCampaign, summary: Summary, facts: Sequence[Fact
     rule = f"({of[RULE].shown})"
     between = " " if len(head) + len(rule) < LINE_CHARACTERS else "\n"
     lines = [*f"{head}{between}{rule}".split("\n"), ""]
-    table = level_table(facts)
-    if len(table) > 1:
-        lines += [*_table_lines(table), ""]
-    of_levels = {fact.name for fact in facts if fact.level is not None}
-    for label, remarks in _remarks(run, summary, of, STARTS_THAT_FAIL in of_levels):
+    shares = {fact.level: fact.shown for fact in facts if fact.name == STARTS_THAT_FAIL}
+    if summary.levels:
+        lines += [*aligned(level_table(summary, shares), left=2), ""]
+    for label, remarks in _remarks(run, summary, of, bool(shares)):
         lines += labelled(label, remarks)
     return lines
 
@@ -103,42 +97,23 @@ def labelled(label: str, lines: Iterable[str]) -> Iterator[str]:
         label = ""
 
 
-def level_table(facts: Iterable[Fact]) -> list[list[str]]:
+def level_table(summary: Summary, shares: Mapping[int | None, str]) -> list[list[str]]:
     """Return the table of POV levels: a head, and a row for each level; no empty column.
 
     Args:
-        facts: facts of a campaign.
+        summary: summary of the campaign.
+        shares: share of all starts that fail, as text, of the levels of which it is known.
     """
     rows = [list(COLUMNS)]
-    for level, of in by_level(facts).items():
-        rows.append(_level_cells(level, of))
+    for level, of in summary.levels.items():
+        found = f"{of.failures:,}" if of.tested else "nothing tested" if of.cases else "not run"
+        coverage = f"{of.fmc:.3f}".removeprefix("0") if of.fmc >= SMALL_FMC else "< .001"
+        row = [level_name(level), shares.get(level, ""), found]
+        for number in (of.undecided, of.cases - of.tested, of.regions):
+            row.append(f"{number:,}" if number else "")
+        rows.append([*row, coverage if of.fmc else ""])
     columns = [column for column in zip(*rows, strict=True) if any(column[1:])]
     return [list(row) for row in zip(*columns, strict=True)]
-
-
-def _level_cells(level: int, of: Mapping[str, Fact]) -> list[str]:
-    """Return the cells of a level by column; "" for none."""
-    cells = [level_name(level), of[STARTS_THAT_FAIL].shown if STARTS_THAT_FAIL in of else ""]
-    if not of[CASES].value:
-        return [*cells, "not run", "", "", "", ""]
-    cells.append(of[FAILURES].shown if FAILURES in of else "nothing tested")
-    for name in (UNDECIDED, WITHOUT_VERDICT, REGIONS):
-        cells.append(of[name].shown if name in of and of[name].value else "")
-    coverage = float(of[FMC].value) if FMC in of else 0.0
-    shown = f"{coverage:.3f}".removeprefix("0") if coverage >= SMALL_FMC else "< .001"
-    return [*cells, shown if coverage else ""]
-
-
-def _table_lines(rows: Sequence[Sequence[str]]) -> list[str]:
-    """Return the lines of a table; numbers are right-aligned."""
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    lines = []
-    for row in rows:
-        cells = []
-        for name, cell, width in zip(rows[0], row, widths, strict=True):
-            cells.append(cell.ljust(width) if name in LEFT else cell.rjust(width))
-        lines.append("   ".join(cells).rstrip())
-    return lines
 
 
 def _remarks(

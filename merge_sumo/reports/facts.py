@@ -40,7 +40,6 @@ ERRORS = "errors"
 TIMEOUTS = "timeouts"
 FAILURES = "failures"
 UNDECIDED = "undecided"
-WITHOUT_VERDICT = "without a verdict"
 CONTACT = "cases with contact that are not failures"
 REGIONS = "regions"
 FMC = "FMC"
@@ -181,7 +180,7 @@ def _of_level(run: RecordedCampaign, level: int, summary: LevelSummary, failing:
     fact = partial(Fact, level=level)
     yield fact(CASES, summary.cases, "level")
     if summary.tested < summary.cases:
-        yield fact(WITHOUT_VERDICT, summary.cases - summary.tested, "end")
+        yield fact("without a verdict", summary.cases - summary.tested, "end")
     if summary.tested or not summary.cases:
         yield fact(FAILURES, summary.failures, failing)
         if run.tolerated:

@@ -6,15 +6,17 @@ apart (Okabe and Ito, 2008).
 
 from __future__ import annotations
 
+import base64
 import importlib
 import io
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from merge_sumo.analysis.cases_file import verdict_of
 from merge_sumo.analysis.reproduction import (
     ColumnResult,
     LevelBatches,
@@ -26,16 +28,29 @@ from merge_sumo.analysis.sampler_study import SamplerStudy
 from merge_sumo.errors import UserError
 from merge_sumo.files import check_new, write_new
 from merge_sumo.metrics.fmc import RADIUS
+from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.records import to_json
-from merge_sumo.reports.pages import page
+from merge_sumo.reports.pages import X_AXIS, page
 from merge_sumo.reports.text import table_ii
+from merge_sumo.road.drawing import POINT_COLOUR
 from merge_sumo.samplers.registry import SAMPLERS
 from merge_sumo.scenario.case import FloatArray
-from merge_sumo.scenario.scenario import OWN, US23, level_name
+from merge_sumo.scenario.scenario import (
+    COLOURS,
+    DT_S,
+    OWN,
+    US23,
+    VEHICLES,
+    Coordinate,
+    level_name,
+)
+from merge_sumo.scenario.trajectory import Trajectory
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+Dims = Sequence[Coordinate]
 
 TRUTH = "truth"
 LEVEL_LOOKS = {
@@ -45,6 +60,13 @@ LEVEL_LOOKS = {
     OWN: ("#009E73", "D"),
 }
 """Colour and marker of each level."""
+VERDICT_COLOURS = {
+    "pass": "#5c6b78",
+    "timeout": "#b00020",
+    "error": "#b00020",
+    "fail": POINT_COLOUR,
+}
+"""Colours of verdicts, as in the report; marks of the last ones lie on top."""
 KINDS = (".png", ".svg")
 STYLE: Any = {
     "axes.titlelocation": "left",
@@ -68,15 +90,23 @@ def check_figure(path: Path) -> None:
         UserError: the file exists, has another ending, or matplotlib is not installed.
     """
     check_new(path, "`figure`", KINDS)
-    require_matplotlib()
+    require("matplotlib")
 
 
-def require_matplotlib() -> None:
-    """Raise `UserError` where matplotlib is not installed."""
+def require(library: str, extra: str = "plot") -> Any:
+    """Import a library of an extra and return it.
+
+    Args:
+        library: name of the library or of its module.
+        extra: the extra that installs it.
+
+    Raises:
+        UserError: it is not installed.
+    """
     try:
-        importlib.import_module("matplotlib")
+        return importlib.import_module(library)
     except ImportError as error:
-        raise UserError("figures need matplotlib: pip install 'merge-sumo[plot]'") from error
+        raise UserError(f"this needs {library}: pip install 'merge-sumo[{extra}]'") from error
 
 
 def save(figure: Figure, path: Path) -> None:
@@ -104,8 +134,7 @@ def save(figure: Figure, path: Path) -> None:
 @contextmanager
 def _drawing(title: str, width: float, height: float) -> Iterator[Figure]:
     """Yield a figure of a size in inches with a title, in the style of the package."""
-    require_matplotlib()
-    import matplotlib
+    matplotlib = require("matplotlib")
     from matplotlib.figure import Figure
 
     with matplotlib.rc_context(STYLE):
@@ -168,9 +197,9 @@ def maps(title: str, panels: Mapping[str, Panel], level: int) -> Figure:
             dots: Any = {"linewidths": 0, "rasterized": True}
             axes.scatter(safe[:, 0], safe[:, 1], s=size / 2, color="#c4c9cf", **dots)
             if panel.points.shape[1] == 2:
-                _balls(axes, failing, level, ink)
+                _balls(axes, failing, US23.dimensions(level), ink)
             axes.scatter(failing[:, 0], failing[:, 1], s=size, color=ink, **dots)
-            _pool_axes(axes, level)
+            _pool_axes(axes, US23.dimensions(level))
             axes.label_outer()
             found = f"{len(failing)} of {len(panel.points)} fail, FMC {panel.fmc:.4f}"
             axes.set_title(name, color=ink, fontweight="bold")
@@ -184,10 +213,10 @@ def _physical(points: FloatArray, level: int) -> FloatArray:
     return np.asarray(low + points * (high - low), dtype=np.float64)
 
 
-def _balls(axes: Axes, centres: FloatArray, level: int, ink: str) -> None:
+def _balls(axes: Axes, centres: FloatArray, dims: Dims, ink: str) -> None:
     from matplotlib.collections import EllipseCollection
 
-    width, height = (2 * RADIUS * (d.high - d.low) for d in US23.dimensions(level))
+    width, height = (2 * RADIUS * (d.high - d.low) for d in dims[:2])
     balls = EllipseCollection(
         [width],
         [height],
@@ -202,8 +231,8 @@ def _balls(axes: Axes, centres: FloatArray, level: int, ink: str) -> None:
     axes.add_collection(balls)
 
 
-def _pool_axes(axes: Axes, level: int) -> None:
-    x, y, *_ = US23.dimensions(level)
+def _pool_axes(axes: Axes, dims: Dims) -> None:
+    x, y, *_ = dims
     axes.set_xlim(x.low, x.high)
     axes.set_ylim(y.low, y.high)
     axes.set_xlabel(x.symbol)
@@ -241,7 +270,7 @@ def predicted_margins(
             marks = {"s": 9, "color": "white", "edgecolors": "black", "linewidths": 0.5}
             axes.scatter(*learned.T, **marks)
             axes.set_title(f"after batch {batch}: {len(learned)} cases")
-            _pool_axes(axes, level)
+            _pool_axes(axes, US23.dimensions(level))
             axes.label_outer()
         bar = figure.colorbar(filled, ax=figure.axes, shrink=0.85, ticks=steps[::5])
         bar.set_label("predicted margin (white line: 0, below which a case fails)")
@@ -280,6 +309,83 @@ def _band(axes: Axes, values: FloatArray, level: int) -> None:
     ink, marker = LEVEL_LOOKS[level]
     axes.fill_between(batches, parts[0], parts[2], color=ink, alpha=0.18, linewidth=0)
     axes.plot(batches, parts[1], color=ink, marker=marker, ms=4, label=level_name(level))
+
+
+# Campaigns in a notebook
+
+
+def _axes(axes: Axes | None) -> Axes:
+    """Return given axes, or those of a new figure that a notebook shows."""
+    if axes is None:
+        _, axes = require("matplotlib.pyplot").subplots(layout="constrained")
+    return axes
+
+
+def draw_map(cases: Sequence[Outcome], dims: Dims, axes: Axes | None = None) -> Axes:
+    """Draw the cases of a POV level in the first two coordinates, in the report's colours.
+
+    Args:
+        cases: outcomes of the cases.
+        dims: coordinates of the level.
+        axes: axes to draw into; None for a new figure.
+
+    Returns:
+        The axes.
+    """
+    axes = _axes(axes)
+    for verdict, ink in VERDICT_COLOURS.items():
+        judged = [one.case for one in cases if verdict_of(one) == verdict]
+        if judged:
+            places = np.array([[d.of(case) for d in dims[:2]] for case in judged])
+            label = f"{len(judged)} {verdict}"
+            axes.scatter(places[:, 0], places[:, 1], s=12, color=ink, label=label)
+            if verdict == "fail" and len(dims) <= 3:
+                _balls(axes, places, dims, ink)
+    _pool_axes(axes, dims)
+    axes.legend(loc="upper left", bbox_to_anchor=(0.0, -0.15), ncols=4, frameon=False)
+    return axes
+
+
+def maps_picture(draw: Callable[[int, Axes], Axes], levels: Sequence[int]) -> str:
+    """Return maps side by side as an element of HTML.
+
+    Args:
+        draw: draws the map of a level into axes.
+        levels: POV levels.
+
+    Raises:
+        UserError: matplotlib is not installed.
+    """
+    with _drawing("", 4.2 * len(levels), 3.8) as figure, io.BytesIO() as picture:
+        for place, level in enumerate(levels, start=1):
+            draw(level, figure.add_subplot(1, len(levels), place))
+        figure.savefig(picture, format="png")
+        data = base64.b64encode(picture.getvalue()).decode()
+    return f'<img alt="A map of the cases of each POV level" src="data:image/png;base64,{data}">'
+
+
+def draw_case(trajectory: Trajectory, title: str, axes: Axes | None = None) -> Axes:
+    """Draw the positions of all cars over time.
+
+    Args:
+        trajectory: the motion.
+        title: title of the axes.
+        axes: axes to draw into; None for a new figure.
+
+    Returns:
+        The axes.
+    """
+    axes = _axes(axes)
+    for name, x_m in zip(VEHICLES, trajectory.whole[:, :, 0].T, strict=False):
+        times_s = DT_S * np.arange(len(x_m))
+        axes.plot(times_s, x_m, color=COLOURS[name], label=name.upper())
+    axes.axhline(0.0, color="gray", lw=0.8)
+    axes.set(title=title, xlabel="time, s", ylabel=X_AXIS)
+    axes.legend(frameon=False)
+    return axes
+
+
+# Reproductions
 
 
 def write_reproduction(result: Reproduction, folder: Path) -> Path:

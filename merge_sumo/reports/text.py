@@ -43,17 +43,20 @@ LISTED = 10
 """Maximum number of cases of each kind that lines name."""
 
 
-def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
-    """Return the lines of a table with right-aligned cells; empty columns are left out.
+def aligned(rows: Sequence[Sequence[str]], left: int = 0) -> list[str]:
+    """Return the lines of a table.
 
     Args:
         rows: cells of each row, the same number in each.
+        left: number of left-aligned columns, the first ones; others are right-aligned.
     """
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     lines = []
     for row in rows:
-        cells = [cell.rjust(width) for cell, width in zip(row, widths, strict=True) if width]
-        lines.append("  ".join(cells).rstrip())
+        cells = [cell.rjust(width) for cell, width in zip(row, widths, strict=True)]
+        for place in range(left):
+            cells[place] = row[place].ljust(widths[place])
+        lines.append("   ".join(cells).rstrip())
     return lines
 
 
