@@ -36,9 +36,9 @@ class TestTheCommand:
 
     def test_begins_its_table_before_the_conflict(self, command_line):
         _, whole, _ = command_line("run", "--vut", "design2", *STALEMATE, "--json")
-        _, out, _ = command_line("run", "--vut", "design2", *STALEMATE, "--from", "-2.5")
+        _, out, _ = command_line("run", "--vut", "design2", *STALEMATE, "--from", "-2.7")
         begins, _, *table = out.splitlines()[-9:]
-        assert begins == "from 6.3 s, 2.5 s before the contact at 8.8 s"
+        assert begins == "from 6.3 s, 2.7 s before the contact at 9.0 s"
         assert [line.split()[0] for line in table] == [f"{6.3 + s:.1f}" for s in range(7)]
         motion = json.loads(whole)["motion"]
         assert [line.split()[1] for line in table] == [f"{car[0][0]:.1f}" for car in motion[63::10]]

@@ -6,6 +6,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 from merge_sumo.road.loader import default_net_path, road_of
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -24,3 +26,11 @@ def test_the_merge_point_is_the_origin_of_all_lanes():
     for path in (road.mainline, road.ramp):
         before, after = path.pieces
         assert before.shape[-1][:2] == after.shape[0][:2] == (0.0, 0.0)
+
+
+def test_the_ramp_comes_nearer_than_the_width_of_a_car_in_its_last_metres_only():
+    """A line with sides of 119 and 408 m and a length of 425 m: 0.28 m aside in a metre."""
+    ramp = road_of().ramp
+    assert ramp.point(-425.0)[1:4] == (0.0, -408.0, -119.0)
+    assert ramp.point(-100.0)[2:4] == pytest.approx((-96.0, -28.0))
+    assert ramp.point(-1.8 / 0.28).y_m == pytest.approx(-1.8)

@@ -122,7 +122,7 @@ def test_the_cars_meet(pictures):
 
 def test_a_car_is_to_scale_on_a_grey_road_with_its_speed_above_it(pictures):
     last = pictures[1]
-    car_px = car(last, "vut")
+    car_px = car(last, "pov")
     (top, left), (bottom, right) = car_px.min(axis=0), car_px.max(axis=0)
     assert len(places(last, (201.0, 199.0, 194.0))) > 5000, "a road as in the report"
     assert 2.0 < (right - left) / (bottom - top) < 3.2, "5 m and 1.8 m"
