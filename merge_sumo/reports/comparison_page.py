@@ -11,6 +11,7 @@ from merge_sumo.analysis.comparison import (
     ComparedCase,
     Comparison,
     VersionChange,
+    outcome_word,
 )
 from merge_sumo.campaigns.printed_commands import command
 from merge_sumo.campaigns.recorded import AGAINST
@@ -55,9 +56,11 @@ def comparison_page(compared: Comparison) -> str:
     lists = []
     for version_change in compared.version_changes:
         for change in Change:
-            if change is Change.BOTH:
-                continue
-            cases = [one for one in version_change.cases if one.change is change]
+            cases = []
+            for one in version_change.cases:
+                is_alike = outcome_word(one.earlier) == outcome_word(one.later)
+                if one.change is change and not (is_alike and change is Change.BOTH):
+                    cases.append(one)
             first, cases_shown = len(shown), cases[: SHOWN - len(shown)]
             shown += [(version_change, one) for one in cases_shown]
             if cases:

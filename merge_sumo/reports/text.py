@@ -132,11 +132,10 @@ def comparison_summary(compared: Comparison) -> list[str]:
     width = max(map(len, names))
     lines = []
     for name, version in zip(names, compared.versions, strict=True):
-        line = f"{name:<{width}}  {version.summary.counts}"
+        lines.append(f"{name:<{width}}  {version.summary.counts}")
         for level, found in version.summary.levels.items():
             if found.failures:
-                line += f", FMC {found.fmc:.4f} at level {level_name(level)}"
-        lines.append(line)
+                lines.append(f"   level {level_name(level)}: FMC {found.fmc:.4f}")
         lines += version.summary.error_lines()
         lines += [f"  {late}" for late in late_errors(version.outcomes)]
     for version_change in compared.version_changes:

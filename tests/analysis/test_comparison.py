@@ -100,9 +100,11 @@ def test_shared_cases_are_paired_wherever_they_stand(tmp_path):
         (Change.BOTH, 0, 2),
     ]
     assert (found.broke, found.worse) == (1, True)
-    assert found.lines()[:6] == [
-        f"1  a, {a.folder}  1 failure (0 contacts) in 3 cases, FMC 0.0079 at level 0",
-        f"2  b, {b.folder}  1 failure (0 contacts) in 3 cases, FMC 0.0079 at level 0",
+    assert found.lines()[:8] == [
+        f"1  a, {a.folder}  1 failure (0 contacts) in 3 cases",
+        "   level 0: FMC 0.0079",
+        f"2  b, {b.folder}  1 failure (0 contacts) in 3 cases",
+        "   level 0: FMC 0.0079",
         "from 1 to 2: of 3 shared cases 1 worse, 1 better, 1 same verdict",
         "  worse            1  safe -> safe (broke)",
         "  better           1  safe -> safe (fixed)",
