@@ -185,9 +185,11 @@ def write_openscenario(run: RecordedCampaign, index: int, folder: Path, road: Ro
 
 def _places(road: Road, trajectory: Trajectory, row: int) -> list[tuple[float, float, float]]:
     """Return x, y and heading of a car at all steps, in m and rad."""
-    places = []
+    places, length_m = [], trajectory.case.scenario.lengths_m[row == VUT]
     for x_m, merged in zip(trajectory.whole[:, row, 0], merged_rows(trajectory), strict=True):
-        _, _, x, y, angle_deg = road.lane_point(float(x_m), on_ramp=row == VUT and not merged)
+        _, _, x, y, angle_deg = road.front_bumper(
+            float(x_m), length_m, on_ramp=row == VUT and not merged
+        )
         # SUMO's angles run clockwise from north, OpenSCENARIO's counterclockwise from east.
         heading = math.remainder(math.radians(90.0 - angle_deg), math.tau)
         places.append((round(x, 9), round(y, 9), round(heading, 9)))

@@ -288,6 +288,18 @@ class Road:
         path = self.ramp if on_ramp else self.mainline
         return path.point(x_m)
 
+    def front_bumper(self, x_m: float, length_m: float, *, on_ramp: bool) -> LanePoint:
+        """Return the front bumper of a car, with the heading that puts both bumpers on the lane.
+
+        Args:
+            x_m: lane coordinate of the front bumper, in m.
+            length_m: length of the car, in m.
+            on_ramp: whether the path is the ramp.
+        """
+        at, rear = (self.lane_point(x, on_ramp=on_ramp) for x in (x_m, x_m - length_m))
+        angle = math.atan2(at.x_m - rear.x_m, at.y_m - rear.y_m)
+        return at._replace(angle_deg=math.degrees(angle) % 360.0)
+
     @property
     def speed_limit_mps(self) -> float:
         """Highest speed limit of both paths."""

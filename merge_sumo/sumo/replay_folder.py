@@ -249,10 +249,13 @@ def motion_record(road: Road, trajectory: Trajectory) -> etree._Element:
     root = etree.Element("fcd-export")
     rows = list(zip(trajectory.whole.tolist(), merged_rows(trajectory).tolist(), strict=True))
     rows += [rows[-1]] * HOLD_STEPS
+    lengths_m = trajectory.case.scenario.lengths_m
     for step, (vehicles, merged) in enumerate(rows):
         timestep = etree.SubElement(root, "timestep", time=f"{step * DT_S:.2f}")
         for who, (x_m, v_mps, _) in zip(VEHICLES, vehicles, strict=False):
-            at = road.lane_point(x_m, on_ramp=who == VEHICLES[VUT] and not merged)
+            is_vut = who == VEHICLES[VUT]
+            length_m = lengths_m[is_vut]
+            at = road.front_bumper(x_m, length_m, on_ramp=is_vut and not merged)
             car = etree.SubElement(timestep, "vehicle", id=who)
             car.set("x", f"{at.x_m:.9f}")
             car.set("y", f"{at.y_m:.9f}")

@@ -53,6 +53,13 @@ def test_a_lane_point_by_hand():
     assert piece.point(140.0) == pytest.approx((30.0, 40.0, 0.0))
 
 
+def test_a_body_has_both_bumpers_on_its_lane_by_hand():
+    # 3 m past the corner of a right angle, with a body of 7 m: its rear is 4 m before the corner.
+    path = LanePath((Piece("a_0", -70.0, 70.0, 30.0, ((0, 0, 0), (30, 0, 0), (30, 40, 0))),))
+    at = replace(road_for(US23), ramp=path).front_bumper(-37.0, 7.0, on_ramp=True)
+    assert at[2:] == pytest.approx((30.0, 3.0, math.degrees(math.atan2(4.0, 3.0))))
+
+
 def test_the_nearest_place_of_a_path_by_hand():
     bend = ((0.0, 0.0, 0.0), (30.0, 0.0, 0.0), (30.0, 40.0, 0.0))
     path = LanePath((Piece("a_0", -140.0, 140.0, 30.0, bend),))
