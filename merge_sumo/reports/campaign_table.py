@@ -79,7 +79,7 @@ def campaign_lines(run: RecordedCampaign, summary: Summary, facts: Sequence[Fact
     lines = [*f"{head}{between}{rule}".split("\n"), ""]
     shares = {fact.level: fact.shown for fact in facts if fact.name == STARTS_THAT_FAIL}
     if summary.levels:
-        lines += [*aligned(level_table(summary, shares), left=2), ""]
+        lines += [*aligned(level_table(summary, shares), left=1 + bool(shares)), ""]
     for label, remarks in _remarks(run, summary, of, bool(shares)):
         lines += labelled(label, remarks)
     return lines
