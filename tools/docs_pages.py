@@ -167,6 +167,7 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
         page: page of MkDocs.
     """
     markdown = TABLE.sub(lambda table: TABLES[table[1]](), markdown)
+    markdown = markdown.replace(".ipynb)", ".md)")  # a notebook is a page of the site
     up = "../" * page.file.src_uri.count("/")
     if page.file.src_uri in SHOWN:
         return markdown.replace(f"]({up}docs/", f"]({up}")
