@@ -513,7 +513,7 @@ function allCases() { // gives what shows the cases that the filters let through
     for (const [n, cell] of [...head.cells].entries()) {
       columns[n] === by ? cell.setAttribute("aria-sort", way > 0 ? "ascending" : "descending") : cell.removeAttribute("aria-sort");
     }
-    byId("matching").textContent = `${found.length} of ${all.length} cases.`;
+    byId("matching").textContent = matching ? `${found.length} of ${all.length} cases.` : "";
     body.replaceChildren();
     rows = 0;
     extend();
