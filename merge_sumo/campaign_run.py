@@ -14,7 +14,6 @@ from merge_sumo.campaigns.recorded import AGAINST, RecordedCampaign, failures
 from merge_sumo.campaigns.repeatability import SecondRun, read_second_runs, unrepeatable
 from merge_sumo.config import AnyRun
 from merge_sumo.errors import UserError
-from merge_sumo.metrics.cause import cause
 from merge_sumo.metrics.measures import Measures
 from merge_sumo.metrics.outcome import Episode, Outcome
 from merge_sumo.metrics.plausibility import doubts, in_vain
@@ -24,6 +23,7 @@ from merge_sumo.metrics.summary import (
     parse_gates,
     summarise,
 )
+from merge_sumo.metrics.timeline import Timeline, timeline
 from merge_sumo.records import to_plain
 from merge_sumo.reports.campaign_table import campaign_lines, labelled
 from merge_sumo.reports.comparison_page import AGAINST_PAGE
@@ -31,6 +31,7 @@ from merge_sumo.reports.facts import Fact, facts_of
 from merge_sumo.reports.figures import draw_case, draw_map, maps_picture, require
 from merge_sumo.reports.text import comparison_summary, episode_lines
 from merge_sumo.result import Result
+from merge_sumo.road.loader import centre_lines, road_for
 from merge_sumo.road.scenario_file import SUFFIX
 from merge_sumo.scenario.trajectory import End, Trajectory
 
@@ -306,12 +307,14 @@ class CaseRun(Result):
     is_good = passed
 
     @property
-    def cause(self) -> str:
-        """The course of the case in a sentence; for a failure also until when it was avoidable."""
-        return cause(self.outcome, self.trajectory)
+    def timeline(self) -> Timeline:
+        """The events of the case, with the kind of a failure."""
+        return timeline(
+            self.outcome, self.trajectory, centre_lines(road_for(self.outcome.case.scenario))
+        )
 
     def __repr__(self) -> str:
-        return f"<case: {self.cause}>"
+        return f"<case: {self.timeline.result}>"
 
     def to_record(self) -> dict[str, Any]:
         """Return the object that `merge-sumo run --json` prints: outcome, motion, and signals."""

@@ -110,11 +110,20 @@ def formats_table() -> str:
     return "\n".join(("| `--format` | written |", "|---|---|", *rows))
 
 
+def kinds_table() -> str:
+    """Return the kinds of failures as a table."""
+    from merge_sumo.metrics.timeline import KINDS
+
+    rows = [f"| {name} | {rule} |" for name, rule in KINDS.items()]
+    return "\n".join(("| kind | rule |", "|---|---|", *rows))
+
+
 TABLES: dict[str, Callable[[], str]] = {
     "kinds of VUT": vut_kinds_table,
     "samplers": samplers_table,
     "criteria": criteria_table,
     "formats": formats_table,
+    "kinds of failures": kinds_table,
 }
 """Tables from registries, which stand in a page as `<!-- table: NAME -->`."""
 TABLE: Final = re.compile(r"<!-- table: ([\w ]+) -->")

@@ -23,14 +23,15 @@ from merge_sumo.analysis.comparison import Change, Comparison
 from merge_sumo.campaigns.recorded import RecordedCampaign, spread_failures
 from merge_sumo.errors import notice
 from merge_sumo.files import check_new, make_folder, write_new
-from merge_sumo.metrics.cause import cause
 from merge_sumo.metrics.criterion import condition_of
 from merge_sumo.metrics.fmc import radius_for
 from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.metrics.summary import one_per_case
+from merge_sumo.metrics.timeline import timeline
 from merge_sumo.printable import printable
 from merge_sumo.records import check_toml_size, toml_value
 from merge_sumo.reports.text import change_in_words
+from merge_sumo.road.loader import centre_lines, road_or_shipped
 from merge_sumo.road.scenario_file import SUFFIX
 from merge_sumo.scenario.case import to_unit
 from merge_sumo.scenario.scenario import Scenario
@@ -58,12 +59,13 @@ def with_file(compared: Comparison, file: CasesFile, path: Path) -> Comparison:
     before = cases_toml(file, file.outcomes, path, file.settings.vut)
     text = cases_toml(file, outcomes.values(), path, now.vut)
     notes: list[str] = []
+    road_lines = centre_lines(road_or_shipped(file.scenario))
     for one in version_change.cases:
         index = one.later.index
         reason = file.accepted.get(index)
         if one.change.group == "worse":
-            why = cause(one.later, now.motion(index))
-            notes.append(f"case {index}, {one.change}: {why}")
+            told = timeline(one.later, now.motion(index), road_lines)
+            notes.append(f"case {index}, {one.change}: {told.in_a_line}")
         elif one.change is Change.WEAKER:
             notes.append(f"case {index}, {one.change}: {change_in_words(one)}")
         elif reason:

@@ -16,11 +16,11 @@ from merge_sumo.analysis.comparison import (
 from merge_sumo.campaigns.printed_commands import command
 from merge_sumo.campaigns.recorded import AGAINST
 from merge_sumo.files import GENERATOR, replace_own
-from merge_sumo.metrics.cause import cause
+from merge_sumo.metrics.timeline import timeline
 from merge_sumo.reports.pages import page
 from merge_sumo.reports.report_data import motion_row, packed, player_data
 from merge_sumo.reports.text import change_in_words, comparison_headline
-from merge_sumo.road.loader import road_or_shipped
+from merge_sumo.road.loader import centre_lines, road_or_shipped
 from merge_sumo.scenario.case import coordinates, described
 from merge_sumo.scenario.scenario import level_name
 
@@ -95,6 +95,7 @@ def _data(
 ) -> dict[str, Any]:
     """Return what the scripts draw: for each case shown both motions, and words on each."""
     scenario = shown[0][1].later.case.scenario
+    road = road_or_shipped(scenario)
     pairs, motions = [], {}
     cases: dict[str, list[Any]] = {}
     for version_change, one in shown:
@@ -109,7 +110,7 @@ def _data(
             replay = ""
             if version.folder is not None:
                 replay = command("replay", version.folder, outcome.index, gui=True)
-            words = cause(outcome, motion)
+            words = timeline(outcome, motion, centre_lines(road)).in_a_line
             side = {"version": f"{number}  {version.vut}", "words": words, "replay": replay}
             sides.append({"case": place, **side})
         case = one.later.case
@@ -118,5 +119,5 @@ def _data(
         pairs.append({"title": title, "name": name, "sides": sides})
     speeds, offsets = packed(motions)
     cases["offset"] = [offsets.get(place, 0) for place in range(2 * len(shown))]
-    drawn = player_data(scenario, road_or_shipped(scenario))
+    drawn = player_data(scenario, road)
     return {"pairs": pairs, "cases": cases, "speeds": speeds, **drawn}

@@ -22,12 +22,13 @@ from merge_sumo.campaigns.recorded import (
     failures,
 )
 from merge_sumo.drivers.reference_drivers import REFERENCE_DRIVERS
-from merge_sumo.metrics.cause import diagnose, kind_and_severity
 from merge_sumo.metrics.fmc import radius_for
 from merge_sumo.metrics.merge import Severity
 from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.metrics.summary import LevelSummary, Summary, by_case
+from merge_sumo.metrics.timeline import timeline
 from merge_sumo.printable import printable
+from merge_sumo.road.loader import centre_lines, road_or_shipped
 
 PERCENT = "%"
 
@@ -236,8 +237,7 @@ def _motion(run: RecordedCampaign, undecided: frozenset[int], failing: str) -> F
     worst = failed[0]
     yield Fact(WORST, worst.index, "lowest margin")
     motion = run.trajectories([worst.index]).get(worst.index)
-    diagnosis = None if motion is None else diagnose(motion, worst.measures)
-    kind = kind_and_severity(worst, diagnosis)
+    kind = timeline(worst, motion, centre_lines(road_or_shipped(run.scenario))).result
     yield Fact(KIND, kind, "severity, impact_speed_mps; by its motion")
     decided = [outcome for outcome in failed if outcome.index not in undecided]
     if avoidable := _values(decided, "avoidable"):

@@ -14,7 +14,7 @@ from merge_sumo.metrics.summary import by_case
 from merge_sumo.printable import printable
 from merge_sumo.reports.facts import Fact, by_level
 from merge_sumo.reports.pages import environment
-from merge_sumo.reports.text import causes, change_in_words, version_change_headline
+from merge_sumo.reports.text import change_in_words, timelines, version_change_headline
 from merge_sumo.scenario.case import described
 from merge_sumo.scenario.scenario import level_name
 
@@ -123,19 +123,19 @@ def _cases(run: RecordedCampaign, undecided: frozenset[int]) -> list[TestCase]:
     for case in by_case(run.outcomes):
         if case.runs > 1:
             runs[case.deciding(run.tolerated).index] = f", {case.in_words}"
-    cause_of = causes(run, [one for one in run.cases if one.failed or not one.is_tested])
+    told = timelines(run, [one for one in run.cases if one.failed or not one.is_tested])
     tests = []
     for outcome in run.cases:
         index, measures = outcome.index, outcome.measures
         name = f"case {index}: {described(outcome.case)}{runs.get(index, '')}"
         test = TestCase(name, f"level {level_name(outcome.case.level)}", measures.t_end_s)
         if index in undecided:
-            test.tag, test.message = "skipped", f"undecided: {cause_of[index]}"
-        elif index in cause_of:
+            test.tag, test.message = "skipped", f"undecided: {told[index].in_a_line}"
+        elif index in told:
             test.tag = "error" if measures.end.is_error else "failure"
             # A criterion may call a case a failure in which the VUT never reached M.
             test.kind = (measures.severity or "failed") if outcome.is_tested else measures.end
-            test.message = cause_of[index]
+            test.message = told[index].in_a_line
         tests.append(test)
     return tests
 

@@ -26,11 +26,11 @@ from merge_sumo.controllers.process import LOG, end_of
 from merge_sumo.drivers.reference_drivers import REFERENCE_DRIVERS
 from merge_sumo.errors import UserError
 from merge_sumo.files import GENERATOR, check_generated, replace_own
-from merge_sumo.metrics.cause import BRAKED_MPS, MEANINGS
 from merge_sumo.metrics.fmc import radius_for
 from merge_sumo.metrics.merge import meanings
 from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.metrics.plausibility import doubts
+from merge_sumo.metrics.timeline import KINDS
 from merge_sumo.reports import facts
 from merge_sumo.reports.comparison_page import AGAINST_PAGE, write_against
 from merge_sumo.reports.facts import by_level
@@ -102,12 +102,11 @@ def report_page(model: ReportModel, *, running: bool = False) -> str:
         levels=by_level(model.facts),
         of={fact.name: fact for fact in model.facts if fact.level is None},
         measure=campaign_command("probability", run.folder, run.record),
-        kinds=Counter(model.kinds.values()).most_common(),
+        kinds=Counter(one.kind for one in model.timelines.values() if one.kind).most_common(),
         # Constants of the sections.
         names=facts,
-        kind_meanings=MEANINGS,
+        kind_meanings=KINDS,
         references=list(REFERENCE_DRIVERS),
-        braked_mps=BRAKED_MPS,
         # Functions that the sections call.
         meanings=meanings,
         robustness=robustness,

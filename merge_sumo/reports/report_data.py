@@ -19,7 +19,7 @@ from merge_sumo.printable import printable
 from merge_sumo.records import to_plain
 from merge_sumo.reports.pages import ERROR_CHARACTERS
 from merge_sumo.reports.report_model import ReportModel
-from merge_sumo.reports.text import causes, changes, name_and_unit
+from merge_sumo.reports.text import changes, name_and_unit
 from merge_sumo.road.drawing import road_data
 from merge_sumo.road.loader import centre_lines
 from merge_sumo.road.road import Road
@@ -52,11 +52,9 @@ def page_data(model: ReportModel) -> dict[str, Any]:
     """
     scenario = model.run.scenario
     speeds, offsets = packed(model.motion)
-    cause_of = causes(model.run, model.shown)
     cases: dict[str, list[Any]] = {"index": []}
     for outcome in model.shown:
         row = _row(model, outcome) | {
-            "cause": cause_of[outcome.index],
             "offset": offsets.get(outcome.index, 0),
         }
         for name, value in row.items():
@@ -130,7 +128,7 @@ def motion_row(outcome: Outcome, motion: Trajectory | None) -> dict[str, Any]:
 def _row(model: ReportModel, outcome: Outcome) -> dict[str, Any]:
     """Return a case by the names of `cases`."""
     index, measures = outcome.index, outcome.measures
-    motion, diagnosis = model.motion.get(index), model.diagnoses.get(index)
+    motion, told = model.motion.get(index), model.timelines[index]
     row: dict[str, Any] = {
         **motion_row(outcome, motion),
         "level": outcome.case.level,
@@ -140,10 +138,9 @@ def _row(model: ReportModel, outcome: Outcome) -> dict[str, Any]:
         "failed": outcome.failed,
         "margin": _rounded(outcome.margin, 3),
         "region": model.regions.get(index),
-        "last_avoidable_s": measures.last_avoidable_s,
-        "vut_brakes_s": diagnosis and diagnosis.vut.brakes_s,
-        "pov_brakes_s": diagnosis and diagnosis.pov.brakes_s,
-        "kind": model.kinds.get(index),
+        "events": [(event.time_s, event.text, event.car) for event in told.events],
+        "result": told.result,
+        "kind": told.kind,
     }
     for coordinate in model.coordinates:
         row[coordinate.field] = _rounded(coordinate.of(outcome.case), coordinate.digits + 2)
@@ -153,7 +150,6 @@ def _row(model: ReportModel, outcome: Outcome) -> dict[str, Any]:
     if model.avoidance:
         avoidance = model.avoidance.get(index)
         row["avoided_by"] = avoidance and avoidance.avoided_by
-        row["latest_takeover_s"] = avoidance and avoidance.latest_takeover_s
         row["pov_careful"] = avoidance and avoidance.pov_careful
     if model.repeated:
         row["runs"] = None

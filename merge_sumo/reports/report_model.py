@@ -10,11 +10,11 @@ from merge_sumo.analysis.stress import STRESS
 from merge_sumo.analysis.surface import Surface, learn_surface
 from merge_sumo.campaigns.printed_commands import campaign_command
 from merge_sumo.campaigns.recorded import RecordedCampaign, failures, regions_of, spread_failures
-from merge_sumo.metrics.cause import Diagnosis, Kind, diagnose
 from merge_sumo.metrics.failure_regions import FailureRegion, failure_regions
 from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.metrics.summary import ErrorGroup, by_case, summarise
 from merge_sumo.reports.facts import facts_of
+from merge_sumo.reports.text import timelines
 from merge_sumo.road.loader import road_or_shipped
 from merge_sumo.scenario.case import coordinates
 from merge_sumo.scenario.scenario import LEVELS
@@ -56,8 +56,7 @@ class ReportModel:
         shown: cases that the page holds one by one, in their order.
         regions: region of each failure, by its index.
         motion: trajectories of the shown cases by index; lost ones are missing.
-        diagnoses: conduct of VUT and POV by index; lost motions have none.
-        kinds: kind of each failure that has one, by its index.
+        timelines: timelines of the shown cases by index.
         described: regions of the pool where cases fail, in words, by level.
         explain: command that explains the case `INDEX`.
 
@@ -99,14 +98,7 @@ class ReportModel:
         self.against = compare_against(run)
         self._choose_cases()
         self.motion = run.trajectories(outcome.index for outcome in self.shown)
-        self.diagnoses: dict[int, Diagnosis] = {}
-        self.kinds: dict[int, Kind] = {}
-        for outcome in self.shown:
-            if motion := self.motion.get(outcome.index):
-                found = diagnose(motion, outcome.measures)
-                self.diagnoses[outcome.index] = found
-                if outcome.failed and found.kind is not None:
-                    self.kinds[outcome.index] = found.kind
+        self.timelines = timelines(run, self.shown)
         self.described: list[FailureRegion] = []
         for level in self.levels:
             self.described += failure_regions(self.cases, level, self.regions)

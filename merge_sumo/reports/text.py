@@ -1,6 +1,6 @@
 """Write results as sentences and lines for a terminal: begin at the functions of `lines_of`.
 
-Each writes one type of result. `causes` and `episode_lines` write cases; `campaign_table.py`
+Each writes one type of result. `timelines` and `episode_lines` write cases; `campaign_table.py`
 writes campaigns.
 """
 
@@ -26,17 +26,17 @@ from merge_sumo.analysis.truth import DENSE_CASES, REAL_REGION, Truth, TruthResu
 from merge_sumo.analysis.vut_check import VutCheck
 from merge_sumo.campaigns.printed_commands import command
 from merge_sumo.campaigns.recorded import RecordedCampaign
-from merge_sumo.metrics.cause import cause, conflicting_car
 from merge_sumo.metrics.fmc import fmc
 from merge_sumo.metrics.measures import recorded_measures
 from merge_sumo.metrics.merge import Conflict
 from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.metrics.plausibility import late_errors
+from merge_sumo.metrics.timeline import Event, Timeline, timeline
 from merge_sumo.printable import counted, either, printable
 from merge_sumo.result import lines_of
-from merge_sumo.road.loader import centre_lines, road_for
-from merge_sumo.scenario.case import Case, coordinates, described
-from merge_sumo.scenario.scenario import DT_S, VEHICLES, level_name
+from merge_sumo.road.loader import centre_lines, road_for, road_or_shipped
+from merge_sumo.scenario.case import Case, coordinates
+from merge_sumo.scenario.scenario import DT_S, NAMES, VEHICLES, level_name
 from merge_sumo.scenario.trajectory import Trajectory
 
 LISTED = 10
@@ -407,17 +407,15 @@ def robustness(found: StressResult) -> str:
 
 @lines_of.register
 def explanation_lines(result: ExplanationResult) -> list[str]:
-    """Return the failure, its cause, and its changes.
+    """Return the failure, its timeline, and its changes.
 
     Args:
         result: the explanation.
     """
     run, found = result.run, result.found
     outcome = run.outcome(found.index)
-    level = level_name(outcome.case.level)
-    lines = [f"case {outcome.index}, POV level {level}: {described(outcome.case)}"]
-    for sentence in causes(run, [outcome]).values():
-        lines.append(f"  {sentence}")
+    told = timelines(run, [outcome])[outcome.index]
+    lines = told.lines(outcome.case, f"case {outcome.index}")
     if found.vut is not None:
         lines.append(f"  so far {printable(run.settings.vut)}; with {printable(found.vut)}:")
     for sentence in changes(found, outcome.case):
@@ -480,8 +478,8 @@ def vut_check_lines(found: VutCheck) -> list[str]:
 # Single cases
 
 
-def causes(run: RecordedCampaign, outcomes: Sequence[Outcome]) -> dict[int, str]:
-    """Return the causes of cases by index, of failures with the drivers that avoid them.
+def timelines(run: RecordedCampaign, outcomes: Sequence[Outcome]) -> dict[int, Timeline]:
+    """Return the timelines of cases by index, of failures with the drivers that avoid them.
 
     Args:
         run: the campaign.
@@ -489,39 +487,38 @@ def causes(run: RecordedCampaign, outcomes: Sequence[Outcome]) -> dict[int, str]
     """
     motions = run.trajectories(outcome.index for outcome in outcomes)
     avoidance = {one.index: _avoidance(one) for one in AVOIDANCE.read_lines(run)}
+    road_lines = centre_lines(road_or_shipped(run.scenario))
     found = {}
     for outcome in outcomes:
-        index = outcome.index
-        found[index] = cause(outcome, motions.get(index), avoidance.get(index, ""))
+        others = avoidance.get(outcome.index, ())
+        found[outcome.index] = timeline(outcome, motions.get(outcome.index), road_lines, others)
     return found
 
 
-def _avoidance(one: Avoidance) -> str:
-    """Return the drivers that would have avoided a failure, in a clause."""
+def _avoidance(one: Avoidance) -> list[Event]:
+    """Return who would have avoided a failure from its start, and until when by taking over."""
     by = either(one.avoided_by) if one.avoided_by else "no reference driver"
-    text = f"in the place of the VUT {by} would have avoided it"
+    text = f"from here on {by} in the place of the VUT would have avoided it"
+    events = [Event(0.0, f"{text}; so would a careful POV" if one.pov_careful else text)]
     if one.latest_takeover_s is not None:
-        text += f", {TAKES_OVER} by taking over until {one.latest_takeover_s:.1f} s"
-    return f"{text}; so would a careful POV" if one.pov_careful else text
+        text = f"last moment at which the reference driver {TAKES_OVER} could take over"
+        events.append(Event(one.latest_takeover_s, text))
+    return events
 
 
 def episode_lines(
     outcome: Outcome, trajectory: Trajectory, from_s: float | None = None
 ) -> list[str]:
-    """Return the case, its cause, its measures, and its motion as a table.
+    """Return the case, its timeline, its measures, and its motion as a table.
 
     Args:
         outcome: the outcome of the case.
         trajectory: its motion.
         from_s: begin of the table in s before the first conflict, such as -3.
     """
-    case = outcome.case
-    lines_of_road = centre_lines(road_for(case.scenario))
+    lines_of_road = centre_lines(road_for(outcome.case.scenario))
     first, begins = Conflict.of(trajectory, lines_of_road).begin(from_s)
-    lines = [
-        f"case: level {level_name(case.level)}, {described(case)}",
-        cause(outcome, trajectory),
-    ]
+    lines = timeline(outcome, trajectory, lines_of_road).lines(outcome.case)
     if outcome.margin is not None:
         verb = "fails" if outcome.failed else "does not fail"
         lines.append(f"{verb}: margin {outcome.margin:.3g}")
@@ -531,7 +528,7 @@ def episode_lines(
 def _measures(outcome: Outcome) -> Iterator[str]:
     """Yield a line for each measure with a label, of the car that the VUT meets, and the faults."""
     found, scenario = outcome.measures, outcome.case.scenario
-    car = conflicting_car(found)
+    car = NAMES[found.nearest]
     if car != "POV":
         yield f"  of the {car}, which is nearest to the VUT at the end:"
     rows = []

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import StrEnum
 
 import numpy as np
@@ -126,17 +126,18 @@ class Trajectory:
     @property
     def nearest(self) -> int:
         """Index of the car of the mainline that is nearest to the VUT at the end of `motion`."""
-        apart_m = np.abs(self.motion[-1, :, 0] - self.motion[-1, VUT, 0])
-        apart_m[VUT] = np.inf
-        return int(np.argmin(apart_m))
+        return self.nearest_at(len(self.motion) - 1)
 
-    def with_pov(self, car: int) -> Trajectory:
-        """Return the motion up to M of the VUT and one car of the mainline.
+    def nearest_at(self, row: int) -> int:
+        """Return the index of the car of the mainline that is nearest to the VUT.
 
         Args:
-            car: index of that car, which takes the place of the POV.
+            row: row of `whole`.
         """
-        return replace(self, motion=self.motion[:, [car, VUT]], after=None)
+        x_m = self.whole[row, :, 0]
+        apart_m = np.abs(x_m - x_m[VUT])
+        apart_m[VUT] = np.inf
+        return int(np.argmin(apart_m))
 
     @property
     def t_end_s(self) -> float:

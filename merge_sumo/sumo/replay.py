@@ -16,9 +16,9 @@ import numpy as np
 
 from merge_sumo.errors import UserError, explained, notice
 from merge_sumo.interrupt import stopping_in_order
-from merge_sumo.metrics.cause import cause
 from merge_sumo.metrics.merge import Conflict
 from merge_sumo.metrics.outcome import Outcome
+from merge_sumo.metrics.timeline import timeline
 from merge_sumo.records import convert, read_record, to_json
 from merge_sumo.result import Result
 from merge_sumo.road.finder import FARTHEST_M
@@ -43,7 +43,6 @@ from merge_sumo.sumo.replay_folder import (
     NET,
     RECORD,
     SCENARIO,
-    case_line,
     files_of,
     motion_record,
     road_of_hosted,
@@ -68,7 +67,7 @@ class Replay(Result):
         rows: number of compared rows, over all vehicles.
         diverged_at_s: time of the first row that differs; None where the replay is identical.
         detail: the difference in words.
-        words: lines on the case, its cause, and a later begin.
+        words: lines on the case, its timeline, and a later begin.
 
     Example:
         >>> ms.replay("scenarios/pov-yields").identical
@@ -93,7 +92,7 @@ class Replay(Result):
         return self.diverged_at_s is None
 
     def lines(self) -> list[str]:
-        """Return the case and its cause, and whether the replay is identical."""
+        """Return the case and its timeline, and whether the replay is identical."""
         if self.diverged_at_s is None:
             return [*self.words, f"identical: {self.rows} rows of x, y and speed"]
         return [*self.words, f"diverged at t = {self.diverged_at_s:.1f} s: {self.detail}"]
@@ -145,7 +144,8 @@ def replay(folder: Path, from_s: float | None = None) -> Replay:
         diverged_at_s = row * DT_S
         detail = f"{VEHICLES[car]} is recorded as not moving at its speed"
     outcome = episode.outcome
-    words = case_line(outcome.case, outcome.index), cause(outcome, episode.trajectory), *begins
+    told = timeline(outcome, episode.trajectory, centre_lines(episode.road))
+    words = *told.lines(outcome.case, f"case {outcome.index}"), *begins
     return Replay(count * cars, diverged_at_s, detail, words)
 
 

@@ -6,7 +6,6 @@ without speed limits (`net_copies`).
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence, Set
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,15 +14,24 @@ import numpy as np
 from lxml import etree
 
 from merge_sumo.files import write_folder
-from merge_sumo.metrics.cause import cause
 from merge_sumo.metrics.merge import merged_rows
 from merge_sumo.metrics.outcome import Outcome
+from merge_sumo.metrics.timeline import Timeline, timeline
 from merge_sumo.records import to_json
 from merge_sumo.road.finder import find_road, read_net
+from merge_sumo.road.loader import centre_lines
 from merge_sumo.road.road import LanePath, Road
 from merge_sumo.road.xml_input import to_bytes
 from merge_sumo.scenario.case import Case, FloatArray, described
-from merge_sumo.scenario.scenario import COLOURS, DT_S, VEHICLES, VUT, Bounds, level_name
+from merge_sumo.scenario.scenario import (
+    COLOURS,
+    DT_S,
+    NAMES,
+    VEHICLES,
+    VUT,
+    Bounds,
+    level_name,
+)
 from merge_sumo.scenario.trajectory import Trajectory
 from merge_sumo.sumo.net_copies import COPY, LANE, hosted_net
 
@@ -36,7 +44,7 @@ LANE_EDGE = LANE.replace(COPY, ".0")
 TYPES = "vehicles.add.xml"
 """Types of the vehicles."""
 LABELS = "labels.add.xml"
-"""Case, cause and legend above the road. Names at the cars would cover each other at M."""
+"""Case, result and legend above the road. Names at the cars would cover each other at M."""
 RECORD = "episode.fcd.xml"
 """Motion of the vehicles as floating car data."""
 VIEW = "view.settings.xml"
@@ -53,13 +61,7 @@ HOLD_STEPS = 10
 """Number of rows of a record that repeat the last one, so that the last picture stays."""
 UNIT = "unit"
 """Last entry of the legend: sumo-gui shows the speed of a car without its unit."""
-NAMES = {
-    "pov": "POV",
-    "vut": "VUT",
-    "ahead": "car ahead",
-    "behind": "car behind",
-    UNIT: "speeds in m/s",
-}
+LEGEND = {**NAMES, UNIT: "speeds in m/s"}
 """Texts of the legend."""
 TEXT = "text"
 """Parameter of a point of interest that sumo-gui shows."""
@@ -204,9 +206,10 @@ def files_of(
         The contents by name, the configuration last.
     """
     view = _view_of(road, record)
+    told = timeline(outcome, trajectory, centre_lines(road))
     roots = {
         TYPES: _types(trajectory),
-        LABELS: _labels(outcome, trajectory, view),
+        LABELS: _labels(outcome, told, view),
         RECORD: record,
         VIEW: view_settings(view),
         CONFIG: _config(len(record)),
@@ -365,23 +368,19 @@ def _config(timesteps: int) -> etree._Element:
     return root
 
 
-def _labels(outcome: Outcome, trajectory: Trajectory, view: View) -> etree._Element:
-    """Return case, cause and legend as points of interest with a text."""
-    words = cause(outcome, trajectory).removesuffix(".")
-    if outcome.measures.end.is_error:
-        words = words.partition(":")[0]  # without the message, which may hold anything
-    # One line for each clause: after a colon, and at the end of a sentence.
-    lines = [case_line(outcome.case, outcome.index), *re.split(r"(?<=:) |\. ", words)]
+def _labels(outcome: Outcome, told: Timeline, view: View) -> etree._Element:
+    """Return case, result and legend as points of interest with a text."""
+    lines = [case_line(outcome.case, outcome.index), told.result]
     root = etree.Element("additional")
     # Lines from the top of the view downwards, and the legend in a row below them.
-    for number, line in enumerate(lines[:4]):
+    for number, line in enumerate(lines):
         at = view.place(0.0, FIRST_LINE_UP - LINE_DOWN * number)
         _label(root, f"line{number}", at, line)
     cars = VEHICLES[: outcome.case.scenario.vehicles]
     for number, name in enumerate((*cars, UNIT)):
         at = view.place(LEGEND_RIGHT * (number - 0.5 * len(cars)), LEGEND_UP)
         colour = COLOURS.get(name, PALE)
-        _label(root, name, at, NAMES[name], colour, DOT * view.width_m)
+        _label(root, name, at, LEGEND[name], colour, DOT * view.width_m)
     return root
 
 

@@ -10,9 +10,7 @@ from merge_sumo.campaigns.recorded import failures
 from merge_sumo.config import NoFailures
 from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.printable import printable
-from merge_sumo.reports.text import causes
-from merge_sumo.scenario.case import described
-from merge_sumo.scenario.scenario import level_name
+from merge_sumo.reports.text import timelines
 
 
 @verb(NoFailures)
@@ -45,10 +43,9 @@ def _message(run: CampaignRun, seed: int) -> str | None:
 
 def _worst(run: CampaignRun, outcome: Outcome, title: str) -> list[str]:
     """Return lines on a case, and the commands that show it."""
-    case, index = outcome.case, outcome.index
+    index, told = outcome.index, timelines(run.recorded, [outcome])[outcome.index]
     return [
-        f"  {title}: case {index}, POV level {level_name(case.level)}, {described(case)}",
-        f"    {causes(run.recorded, [outcome])[index]}",
+        *(f"  {line}" for line in told.lines(outcome.case, f"{title}: case {index}")),
         f"    replay it: {command('replay', run.folder, index, gui=True)}",
         f"    run it again: {campaign_command('run', run.folder, run.settings, index)}",
     ]

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from metrics.test_diagnosis import drive
+from metrics.test_timeline import drive
 
 from merge_sumo.metrics.measures import Measures, sustained_brake_mps2
 from merge_sumo.metrics.outcome import Outcome

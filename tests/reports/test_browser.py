@@ -21,7 +21,7 @@ from merge_sumo.metrics.merge import Conflict, Severity
 from merge_sumo.records import to_plain
 from merge_sumo.reports import report
 from merge_sumo.reports.comparison_page import comparison_page
-from merge_sumo.reports.text import changes
+from merge_sumo.reports.text import changes, timelines
 from merge_sumo.road.loader import centre_lines, road_for
 from merge_sumo.scenario.scenario import DT_S, US23
 
@@ -188,11 +188,12 @@ def test_errors_and_timeouts_are_drawn_as_no_result_shown_first_and_grouped(brow
         )
         assert sorted(map(int, drawn)) == [0, 3, 4, 6, 9, 11]
         page.locator(".untested [data-case='4']").click()
-        assert page.inner_text("#case-words").startswith("VUT_ERROR at ")
+        assert page.inner_text("#case-words").startswith("VUT_ERROR")
+        assert page.locator("#case-timeline li").last.inner_text().endswith("boom")
         page.locator(".lists [data-case='3']").click()
-        words = page.inner_text("#case-words")
-        assert words.startswith("Timeout: the VUT ")
-        assert "and the VUT did not reach the merge point in" in words
+        assert page.inner_text("#case-words").startswith("Timeout")
+        last = page.locator("#case-timeline li").last.inner_text()
+        assert "the VUT did not reach the merge point in" in last
         verdict = page.locator("#filters [name=verdict]")
         for label, expected in (
             ("boom (2)", [4, 11]),
@@ -203,7 +204,7 @@ def test_errors_and_timeouts_are_drawn_as_no_result_shown_first_and_grouped(brow
             assert sorted(rows(page)) == expected
 
 
-def test_why_a_failure_failed_is_drawn_and_said(browser, tmp_path):
+def test_the_timeline_and_the_changes_of_a_failure_are_drawn_and_said(browser, tmp_path):
     run = write_run(tmp_path / "run", errors={})
     first, second = [o for o in failures(run.outcomes) if o.case.level == 1][:2]
     x_m, v_mps = first.case.x_pov0_m, first.case.v_pov0_mps
@@ -217,9 +218,7 @@ def test_why_a_failure_failed_is_drawn_and_said(browser, tmp_path):
     line = json.dumps(to_plain(known))
     (run.folder / EXPLANATIONS.name).write_text(f"{line}\n", encoding="utf-8")
     words = list(changes(known, first.case))
-    moments = [
-        t for t in (first.measures.last_avoidable_s, first.measures.t_end_s) if t is not None
-    ]
+    told = timelines(run, [first])[first.index]
     with shown(browser, report.write_report(run)) as page:
         page.evaluate(f"location.hash = '#case-{first.index}'")
         page.locator("#why-known").wait_for()
@@ -228,8 +227,14 @@ def test_why_a_failure_failed_is_drawn_and_said(browser, tmp_path):
         signed = [f"{value:.1f}".replace("-", "\u2212") for value in (x_m, below_m, above_m)]
         of_start = [f"x_POV0 {signed[0]} m", *signed[1:], f"v_POV0 {v_mps:.2f} m/s", "25.50"]
         assert texts == [*of_start, "vut: gap_m 16.20", "14.10"]
-        drawn = page.locator("#why-time text.named").all_text_contents()
-        assert [float(text.split()[-2]) for text in drawn] == [round(t, 1) for t in moments]
+        listed = page.locator("#case-timeline li").all_text_contents()
+        assert listed == [f"{event.time_s:.1f} s {event.text}" for event in told.events]
+        marks = page.locator("#marks button")
+        assert marks.count() == len(listed)
+        for buttons in (marks, page.locator("#case-timeline button")):
+            page.evaluate("at(0)")
+            buttons.last.click()
+            assert page.inner_text("#time-value") == f"{told.events[-1].time_s:.1f} s"
         page.evaluate(f"location.hash = '#case-{second.index}'")
         page.locator("#why-ask").wait_for()
         assert not page.locator("#why-known").is_visible()

@@ -15,9 +15,9 @@ from support.plans import plan_for
 from merge_sumo.controllers.kinds import load
 from merge_sumo.controllers.spec import ControllerOptions
 from merge_sumo.errors import UserError
-from merge_sumo.metrics.cause import cause
 from merge_sumo.metrics.criterion import Criterion
 from merge_sumo.metrics.measures import Measures
+from merge_sumo.metrics.timeline import timeline
 from merge_sumo.scenario.case import Pool
 from merge_sumo.scenario.scenario import US23, VUT
 from merge_sumo.scenario.trajectory import End
@@ -110,5 +110,7 @@ class TestFollowUp:
             assert len(trajectory.after) < 10
             without = replace(trajectory, error=None)
             assert Measures.of(trajectory).score == Measures.of(without).score
-            words = cause(Criterion().outcome(trajectory), trajectory)
-            assert words.endswith("After M an error ends the follow-up.")
+            outcome = Criterion().outcome(trajectory)
+            (*_, last) = timeline(outcome, trajectory, None).events
+            ends = "an error ends the follow-up: ZeroDivisionError"
+            assert last.text.startswith("the VUT reaches" if outcome.failed else ends)

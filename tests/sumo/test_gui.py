@@ -16,8 +16,8 @@ from PIL import Image, ImageColor
 
 from merge_sumo.campaigns.campaign import export_case
 from merge_sumo.campaigns.recorded import failures
-from merge_sumo.metrics.cause import cause
 from merge_sumo.metrics.merge import Conflict
+from merge_sumo.reports.text import timelines
 from merge_sumo.road.loader import centre_lines, road_for
 from merge_sumo.scenario.scenario import COLOURS, DT_S, US23
 from merge_sumo.sumo.replay_folder import LABELS, VIEW
@@ -142,16 +142,13 @@ def test_it_begins_before_the_conflict_and_looks_the_same_from_there_on(
     assert (taken == pictures[1]).all()
 
 
-def test_the_window_has_the_case_its_cause_and_the_colours_of_the_report(run, pictures, tmp_path):
+def test_the_window_has_the_case_its_result_and_the_colours_of_the_report(run, pictures, tmp_path):
     outcome = failures(run.outcomes)[0]
     export_case(run, outcome.index, tmp_path / "case")
     labels = etree.parse(tmp_path / "case" / LABELS).getroot()
-    case, head, course, way_out, *legend = (
-        str(param.get("value")) for param in labels.iter("param")
-    )
+    case, result, *legend = (str(param.get("value")) for param in labels.iter("param"))
     assert case.startswith(f"case {outcome.index}, POV level {outcome.case.level}: x_POV0 ")
-    said = cause(outcome, run.trajectory(outcome.index))
-    assert f"{head} {course}. {way_out}." == said
+    assert result == timelines(run, [outcome])[outcome.index].result
     assert legend == ["POV", "VUT", "speeds in m/s"]
     for image in pictures:
         top = image[: round(LABELS_SHARE * image.shape[0])]

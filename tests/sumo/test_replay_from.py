@@ -46,7 +46,7 @@ def assert_continues(monkeypatch):
             assert whole.endswith(rows)
             assert part.identical
             assert part.rows == rows.count(b"<vehicle ")
-            assert part.words[2].startswith(f"from {begin_s:.1f} s, ")
+            assert part.words[-1].startswith(f"from {begin_s:.1f} s, ")
 
     monkeypatch.setattr(replay_module, "run_program", kept)
     return check
@@ -77,7 +77,7 @@ def test_also_where_vehicles_are_inside_of_junctions(assert_continues):
 class TestTheCommand:
     def test_prints_the_begin_and_its_reason(self, command_line):
         code, out, _ = command_line("replay", STALEMATE, "--from", "-3")
-        _, _, begins, verdict = out.splitlines()
+        *_, begins, verdict = out.splitlines()
         assert (code, begins) == (0, "from 6.3 s, 3 s before the contact at 9.3 s")
         # 6.3 to 14.6 s, and the 10 rows that hold the end: 93 rows of two cars.
         assert verdict == "identical: 186 rows of x, y and speed"

@@ -44,7 +44,8 @@ function title(i) {
 }
 function words(i) {
   const margin = cases.margin[i] === null ? "" : `${undecided(i) ? "Undecided" : failed(i) ? "Fails" : "Does not fail"}: margin ${cases.margin[i]}.`;
-  return [cases.cause[i], margin, runsInWords(i)].filter(Boolean).join(" ");
+  const { [i]: result } = cases.result;
+  return [`${result[0].toUpperCase()}${result.slice(1)}.`, margin, runsInWords(i)].filter(Boolean).join(" ");
 }
 
 /* ---------- grids: the surrogate's failure probability ---------- */
@@ -312,41 +313,43 @@ function show(i) {
   byId("case-motion").hidden = moving === null;
   byId("why").hidden = !failed(i) || moving === null;
   play(false);
+  timeline(i);
   if (moving) showMotion(i);
 }
 function showMotion(i) {
-  const flags = [[moving.met, cases.pov_brakes_s[i]], [VUT, cases.vut_brakes_s[i]]].filter(([, t]) => t !== null);
-  animate(moving, flags, (end) => [...signalCharts(i, end), ...whyCharts(i)]);
+  const flags = cases.events[i].filter(([, text]) => text.includes(" brakes: ")).map(([t, , car]) => [vehicles.indexOf(car), t]);
+  animate(moving, flags, (end) => signalCharts(i, end));
+  whyCharts(i);
   at(failed(i) ? moving.until : 0);
   const [row, what] = cases.conflict[i];
   Object.assign(byId("before"), { title: `Plays from 3 s before ${what} at ${fixed(row * DT, 1)} s`, onclick: () => { at(row - 3 / DT); if (!playing) play(true); } });
 }
-function whyCharts(i) { // why it failed: until when something could be done, and with which changes it passes
+function timeline(i) { // the events of a case as a list, and as marks on the time axis of the player
+  const marks = [], lines = [], end = moving && (moving.rows - 1) * DT;
+  for (const [t, text, car] of cases.events[i]) {
+    const line = document.createElement("li"), button = document.createElement("button");
+    Object.assign(button, { type: "button", textContent: `${fixed(t, 1)} s`, disabled: !moving });
+    button.addEventListener("click", () => { play(false); at(t / DT); });
+    line.append(button, ` ${text}`);
+    lines.push(line);
+    if (!moving) continue;
+    const mark = document.createElement("button");
+    Object.assign(mark, { type: "button", className: car ?? "", title: `${fixed(t, 1)} s: ${text}` });
+    mark.setAttribute("aria-label", mark.title);
+    mark.style.setProperty("--at", t / (end || 1));
+    mark.addEventListener("click", () => { play(false); at(t / DT); });
+    marks.push(mark);
+  }
+  byId("case-timeline").replaceChildren(...lines);
+  byId("marks").replaceChildren(...marks);
+}
+function whyCharts(i) { // with which changes a failure passes
   const found = data.why[cases.index[i]];
   byId("why-known").hidden = !found;
   byId("why-ask").hidden = Boolean(found);
-  if (!found) return [];
+  if (!found) return;
   byId("why-words").replaceChildren(...found.words.map((text) => Object.assign(document.createElement("li"), { textContent: text })));
   drawAxes(byId("why-changes"), found.axes);
-  return [moments(byId("why-time"), i)];
-}
-function moments(svg, i) { // both positions, and the last moments at which something helps
-  const { until, x } = moving, end = until * DT;
-  const lines = vehicles.map((name, who) => ({ name, points: x[who].slice(0, until + 1).map((place, t) => [t * DT, place]) }));
-  const dots = [{ name: "merged", x: end, y: x[VUT][until] }];
-  const yRange = range(lines.flatMap(({ points }) => points.map(([, y]) => y)));
-  const chart = plot(svg, { xRange: [0, end], yRange, xLabel: "time, s", lines, dots }), [top, bottom] = [8, 162];
-  const never = cases.kind[i] !== null && cases.last_avoidable_s[i] === null, closes = never ? 0 : cases.last_avoidable_s[i];
-  if (closes !== null) draw(svg, "rect", { class: "danger", x: chart.X(closes), y: top, width: chart.to - chart.X(closes), height: bottom - top });
-  const takeover = cases.latest_takeover_s?.[i] ?? null;
-  const flags = [[takeover, "take-over until"], [closes, never ? "never a way out from" : "way out until"], [end, "ends at"]];
-  for (const [row, [t, what]] of flags.entries()) {
-    if (t === null) continue;
-    draw(svg, "line", { class: "moment", x1: chart.X(t), x2: chart.X(t), y1: top + 14 * row, y2: bottom });
-    const late = chart.X(t) > 140; // its text is before the line
-    draw(svg, "text", { class: "named", x: chart.X(t) + (late ? -4 : 4), y: top + 10 + 14 * row, "text-anchor": late ? "end" : "start" }, `${what} ${fixed(t, 1)} s`);
-  }
-  return chart;
 }
 function drawAxes(svg, axes) { // a bar for each thing: what fails around the case, and the nearest values that pass
   const height = 56, [left, right] = [62, 298];

@@ -1,0 +1,259 @@
+"""The timeline of a case: its events in the order of time, and the kind of a failure.
+
+Terminal, report, player and JUnit files show what `timeline` returns. A vehicle brakes in a phase
+in which its speed falls by 1 m/s or more without a pause of a second, and accelerates in one in
+which it rises so. A speed pauses where it changes by less than 0.1 m/s2.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from merge_sumo.metrics.bodies import CentreLines
+from merge_sumo.metrics.criterion import CRITERIA, PAPER, condition_of, values_of
+from merge_sumo.metrics.merge import Conflict, Severity
+from merge_sumo.metrics.outcome import Outcome
+from merge_sumo.metrics.summary import message_of
+from merge_sumo.scenario.case import Case, FloatArray, described
+from merge_sumo.scenario.scenario import DT_S, NAMES, VEHICLES, VUT, Vehicle, level_name
+from merge_sumo.scenario.trajectory import End, Trajectory
+
+CHANGED_MPS = 1.0 - 1e-6
+"""Change of speed that counts, without rounding errors; the jitter of a network is smaller."""
+STEADY_MPS = 0.01 - 1e-6
+"""Change of speed in a step below which the speed pauses."""
+PAUSE_STEPS = 10
+"""Number of such steps that end a phase."""
+KIND_STEPS = 30
+"""Steps before the last event in which the conduct of both vehicles gives the kind."""
+KINDS = {
+    "did not arrive": "the VUT does not merge in time",
+    "rule broken": "the rule is one of the user, and none of contact, distance or braking after M",
+    "cut in": "the VUT keeps the limit at M, and a car behind it then touches it or has to brake",
+    "late brake": "the VUT brakes, and began when no way out was left",
+    "both brake": "both brake, and the VUT began while a way out was left",
+    "weak brake": "only the VUT brakes, and began while a way out was left",
+    "both accelerate": "both accelerate",
+    "squeeze": "the VUT does not brake, and one car at most accelerates",
+}
+"""Rules of the kinds of failures; the first rule that holds names a failure. A vehicle brakes here
+if, in the 3 s before the last event, its speed last differed by 1 m/s when it was higher than at
+that event, and accelerates if it was lower. A way out is full braking or full acceleration that
+keeps the scenario's limit at M."""
+
+
+@dataclass(frozen=True, slots=True)
+class Event:
+    """An event of a case.
+
+    Attributes:
+        time_s: its time; of a phase, its begin.
+        text: what happens, in a clause.
+        car: the vehicle that brakes or accelerates, or that the VUT meets; else None.
+    """
+
+    time_s: float
+    text: str
+    car: Vehicle | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Timeline:
+    """The events of a case, and its result.
+
+    Attributes:
+        events: the events in the order of time; the last one of a failure breaks the rule.
+        result: kind and severity in words, with the speed of an impact.
+        kind: kind of a failure, of `KINDS`; None for other cases, and where the motion is lost.
+    """
+
+    events: tuple[Event, ...]
+    result: str
+    kind: str | None
+
+    @property
+    def in_a_line(self) -> str:
+        """Result and last event, where one line is shown."""
+        return f"{self.result}: {self.events[-1].text}"
+
+    def lines(self, case: Case, name: str = "case") -> list[str]:
+        """Return result, coordinates and events of a case as lines of a terminal.
+
+        Args:
+            case: the case.
+            name: its name.
+        """
+        start = f"POV level {level_name(case.level)}, {described(case)}"
+        lines = [f"{name}: {self.result}    {start}"]
+        for event in self.events:
+            lines.append(f"  {event.time_s:5.1f} s   {event.text}")
+        return lines
+
+
+def timeline(
+    outcome: Outcome,
+    trajectory: Trajectory | None,
+    lines: CentreLines | None,
+    others: Sequence[Event] = (),
+) -> Timeline:
+    """Return the timeline of a case.
+
+    Args:
+        outcome: the outcome.
+        trajectory: its motion; None where that is lost.
+        lines: centre lines of the road; None to look for a contact from M on only.
+        others: further events, such as the last moment for another driver.
+
+    Example:
+        >>> case = ms.run(vut="design1", level=0, x_pov0_m=-290, v_pov0_mps=34)
+        >>> timeline(case.outcome, case.trajectory, None).events[-1].text
+        'the VUT reaches the merge point 2.6 m ahead of the POV: contact at 8.2 m/s'
+    """
+    found, rule, kind = outcome.measures, _rule(outcome), None
+    ends = [*_ends(outcome, trajectory, lines, rule)]
+    *ends, last = sorted(ends, key=lambda event: event.time_s)
+    events = [*ends, *others, *_way_out(outcome)]
+    if trajectory is not None:
+        events += _phases(outcome, trajectory, {end.car for end in (*ends, last)})
+        if outcome.failed:
+            kind = _kind(outcome, trajectory, last, rule)
+            events = [event for event in events if event.time_s <= last.time_s]
+    events = sorted([*events, last], key=lambda event: event.time_s)
+    result = found.result if found.end.is_error else found.result.lower()
+    if outcome.failed:
+        result = f"{kind or 'failure'}, {result}"
+    if found.impact_speed_mps is not None:
+        result += f" at {found.impact_speed_mps:.1f} m/s"
+    return Timeline(tuple(events), result, kind)
+
+
+def phases(v_mps: FloatArray) -> Iterator[tuple[int, int]]:
+    """Yield first and last row of each phase in which a vehicle brakes or accelerates.
+
+    Args:
+        v_mps: its speeds, (T + 1,), in m/s.
+    """
+    for sign in (-1.0, 1.0):
+        gained_mps = sign * v_mps
+        rows = np.flatnonzero(np.diff(gained_mps) > STEADY_MPS)
+        back_mps = gained_mps[rows[:-1] + 1] - gained_mps[rows[1:]]
+        ends = (np.diff(rows) > PAUSE_STEPS) | (back_mps > CHANGED_MPS)
+        for part in np.split(rows, np.flatnonzero(ends) + 1):
+            if part.size and gained_mps[part[-1] + 1] - gained_mps[part[0]] > CHANGED_MPS:
+                yield int(part[0]), int(part[-1]) + 1
+
+
+def _phases(outcome: Outcome, trajectory: Trajectory, met: set[Vehicle | None]) -> Iterator[Event]:
+    """Yield the phases of the VUT and of the cars that it meets."""
+    last_s = outcome.measures.last_avoidable_s if outcome.failed else None
+    for car, name in enumerate(VEHICLES):
+        if car != VUT and name not in met:
+            continue
+        v_mps = trajectory.whole[:, car, 1]
+        for begin, end in phases(v_mps):
+            time_s, brakes = _time_s(begin), v_mps[end] < v_mps[begin]
+            does = "brakes" if brakes else "accelerates"
+            text = f"the {NAMES[name]} {does}: {v_mps[begin]:.1f} to {v_mps[end]:.1f} m/s"
+            if brakes and car == VUT and last_s is not None and time_s > last_s:
+                text += f", {time_s - last_s:.1f} s too late"
+            yield Event(time_s, text, name)
+
+
+def _way_out(outcome: Outcome) -> Iterator[Event]:
+    """Yield until when the VUT could keep its distance at M."""
+    last_s, scenario = outcome.measures.last_avoidable_s, outcome.case.scenario
+    if outcome.failed and last_s is not None:
+        yield Event(last_s, "last way out: full braking or full acceleration")
+    elif outcome.failed and outcome.measures.is_close:
+        kept = f"{scenario.dx_crash_m:g} m at {scenario.place}"
+        yield Event(0.0, f"no way out: neither full braking nor full acceleration keeps {kept}")
+
+
+def _rule(outcome: Outcome) -> str | None:
+    """Return the named criterion by which a case fails; None without one."""
+    if not outcome.failed or outcome.is_by_score:
+        return PAPER if outcome.failed else None
+    for name, criterion in CRITERIA.items():
+        condition = condition_of(criterion.condition)
+        if condition.margin(values_of(outcome.measures, condition.names)) == outcome.margin:
+            return name
+    return None
+
+
+def _ends(
+    outcome: Outcome, trajectory: Trajectory | None, lines: CentreLines | None, rule: str | None
+) -> Iterator[Event]:
+    """Yield merge, contact and what follows; by the last one in time a failure breaks the rule."""
+    found, scenario, contact_s = outcome.measures, outcome.case.scenario, None
+    text, car, impact = message_of(outcome), found.nearest, ""
+    if found.end is End.MERGED:
+        text = f"the VUT reaches {scenario.goal}"
+        if found.lane_share is not None:
+            text = f"the VUT merges at {found.lane_share:.2f} of the lane,"
+        side = "ahead of" if found.merged_first == "VUT" else "behind"
+        text += f" {abs(found.dx_m or 0.0):.1f} m {side} the {NAMES[car]}"
+    if trajectory is not None and found.impact_speed_mps is not None:
+        row = Conflict.of(trajectory, lines).row
+        contact_s, car = _time_s(row), VEHICLES[trajectory.nearest_at(row)]
+        impact = f"contact at {found.impact_speed_mps:.1f} m/s"
+    if contact_s == found.t_end_s:
+        text += f": {impact}"
+    elif rule == PAPER:
+        text += f": closer than {scenario.dx_crash_m:g} m"
+    elif rule is not None and contact_s is None:
+        needed = found.brake_after_mps2
+        text += f": braking of {needed:.1f} m/s2 must follow" if needed else ": too near to brake"
+    if rule in (None, PAPER) or contact_s is None or contact_s >= found.t_end_s:
+        yield Event(found.t_end_s, text, found.nearest)
+    if contact_s not in (None, found.t_end_s):
+        yield Event(contact_s, impact, car)
+    if trajectory is None:
+        return
+    hardest_mps2 = found.after_brake_mps2
+    if hardest_mps2 and contact_s is None and (rule or found.severity == Severity.HARSH):
+        a_mps2 = trajectory.whole[len(trajectory.motion) - 1 :, :, 2]
+        row, index = divmod(int(np.abs(a_mps2 + hardest_mps2).argmin()), len(a_mps2[0]))
+        text = f"the {NAMES[VEHICLES[index]]} brakes hardest after the merge"
+        time_s = round(found.t_end_s + row * DT_S, 1)
+        yield Event(time_s, f"{text}: -{hardest_mps2:.1f} m/s2", VEHICLES[index])
+    last_s = _time_s(len(trajectory.whole) - 1)
+    if outcome.failed and rule is None and found.end is End.MERGED:
+        yield Event(last_s, f"fails: margin {outcome.margin:.3g}")
+    if outcome.passes and found.error is not None:
+        yield Event(last_s, f"an error ends the follow-up: {message_of(outcome)}")
+
+
+def _kind(outcome: Outcome, trajectory: Trajectory, last: Event, rule: str | None) -> str:
+    """Return the kind of a failure by the speeds before its last event."""
+    found, row = outcome.measures, round(last.time_s / DT_S)
+    if found.end is not End.MERGED:
+        return "did not arrive"
+    if rule is None:
+        return "rule broken"
+    now = trajectory.whole[row]
+    car = trajectory.nearest_at(row) if last.car == VEHICLES[VUT] else VEHICLES.index(last.car)
+    is_after = last.time_s >= found.t_end_s and not found.is_close
+    if is_after and now[car, 0] < now[VUT, 0]:
+        return "cut in"
+    vut, other = (_trend(trajectory.whole[: row + 1, who, 1]) for who in (VUT, car))
+    if vut >= 0.0:
+        return "both accelerate" if vut > 0.0 and other > 0.0 else "squeeze"
+    v_mps, way_out_s = trajectory.whole[:, VUT, 1], found.last_avoidable_s
+    begun_s = [_time_s(a) for a, b in phases(v_mps) if v_mps[b] < v_mps[a] and a < row]
+    if found.is_close and begun_s and (way_out_s is None or begun_s[-1] > way_out_s):
+        return "late brake"
+    return "both brake" if other < 0.0 else "weak brake"
+
+
+def _trend(v_mps: FloatArray) -> float:
+    """Return whether a vehicle brakes at last, -1, accelerates, 1, or keeps its speed, 0."""
+    gained_mps = v_mps[-1] - v_mps[-KIND_STEPS - 1 :]
+    changed = gained_mps[np.abs(gained_mps) > CHANGED_MPS]
+    return float(np.sign(changed[-1])) if changed.size else 0.0
+
+
+def _time_s(row: int) -> float:
+    return round(row * DT_S, 1)
