@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import argparse
 import difflib
+import hashlib
 import io
 import re
 import shutil
@@ -72,6 +73,9 @@ CLIPPED_TEXTS = """() => {
   return clipped;
 }"""
 """Texts whose middle is in a box that they leave."""
+SLOWNESS_MS = "300"
+"""Delay of sumo-gui for each simulated second, so that its window is open before the picture."""
+LEAST_WIDTH_PX = 600
 DESCRIPTION = "Description"
 """Name of the text in a PNG."""
 LINES_SHOWN = 20
@@ -125,25 +129,29 @@ def gui_picture(name: str, time_s: float, new: Path | None) -> str:
         new: new file; None for the text alone.
 
     Returns:
-        What sumo-gui is told to show: texts, colours and the view.
+        What sumo-gui is told to show: texts, colours and the view, and a hash of road and motion.
     """
     parser = etree.XMLParser(resolve_entities=False, no_network=True)
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch) / name
-        scenario_folder(name, folder)
+        digest = hashlib.sha256(scenario_folder(name, folder).encode()).hexdigest()
         text = "".join((folder / file).read_text(encoding="utf-8") for file in (LABELS, VIEW))
+        text += f"SHA-256 of the folder: {digest}"
         if new:
             view = etree.parse(folder / VIEW, parser).getroot()
             etree.SubElement(view, "snapshot", file=str(new), time=str(time_s))
             etree.ElementTree(view).write(folder / VIEW)
             settings = etree.parse(folder / CONFIG, parser).getroot()
             etree.strip_elements(settings, "delay", "quit-on-end", "breakpoints")
-            etree.SubElement(settings, "delay", value="0")
+            etree.SubElement(settings, "delay", value=SLOWNESS_MS)
             etree.SubElement(settings, "quit-on-end", value="true")
             etree.ElementTree(settings).write(folder / CONFIG)
             reason = run_program("sumo-gui", ["-c", CONFIG], folder, limit_s=None)
             if reason or not new.exists():
                 sys.exit(f"sumo-gui took no picture: {reason}")
+            with Image.open(new) as image:
+                if image.width < LEAST_WIDTH_PX:
+                    sys.exit("sumo-gui had not opened its window: make this picture again")
     return text
 
 
