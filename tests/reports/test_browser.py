@@ -254,10 +254,15 @@ def test_two_cars_at_contact_are_drawn_to_scale_with_outlines_the_one_behind_on_
             page.evaluate(f"location.hash = '#case-{case.index}'")
             page.wait_for_function(f"chosen === place.get({case.index})")
             page.evaluate(f"at({case.measures.t_end_s / DT_S:.0f})")
-            cars = page.locator("#road .car").evaluate_all(
-                """all => all.map((car) => [car.classList[1], car.getAttribute("width"),
-                car.getAttribute("height"), getComputedStyle(car).strokeWidth,
-                car.parentNode.getAttribute("transform").split(" ").pop()])"""
+            cars = page.locator("#road .car, #road .outline").evaluate_all(
+                """all => all.map((car) => [car.classList.value, car.getAttribute("width"),
+                car.getAttribute("height"),
+                car.closest("[transform]").getAttribute("transform")])"""
             )
-            drawn = ["5", "1.8", "0.25px", "scale(1)"]
-            assert cars == [[ahead, *drawn], [behind, *drawn]]
+            under, over, *outlines = cars
+            assert (under[0], over[0]) == (f"car {ahead}", f"car {behind}")
+            for body, outline in zip(sorted((under, over)), outlines, strict=True):
+                name, *where = body
+                assert outline == [name.replace("car", "outline"), *where], "above all bodies"
+                assert where[:2] == ["5", "1.8"]
+                assert where[2].endswith("scale(1)")

@@ -133,12 +133,15 @@ function TopView(svg) {
     for (const lane of [data.main, data.ramp]) draw(svg, "path", { class: "lane", d: path(lane.map(([, x, y]) => [x, -y])), "stroke-width": 3.05 });
     LANE ? drawLane() : draw(svg, "line", { class: "merge", x1: 0, x2: 0, y1: -2.6, y2: 2.6, "stroke-width": 0.25 });
     layer = draw(svg, "g");
+    const outlines = draw(svg, "g"); // above all bodies, so that a car below another one is seen
     for (const who of vehicles) {
       const group = draw(layer, "g");
       const length = lengthOf(who), side = { y: -data.width_m / 2, height: data.width_m };
-      draw(group, "rect", { class: `car ${who}`, x: -length, width: length, rx: 0.4, ...side });
+      const body = { x: -length, width: length, rx: 0.4, ...side };
+      draw(group, "rect", { class: `car ${who}`, ...body });
+      const outline = draw(outlines, "rect", { class: `outline ${who}`, ...body });
       const brake = draw(group, "rect", { class: "brake", x: -length, width: 0.5, ...side });
-      cars[who] = { group, brake, label: draw(svg, "text", { "text-anchor": "middle" }) };
+      cars[who] = { group, outline, brake, label: draw(svg, "text", { "text-anchor": "middle" }) };
     }
   };
   const across = (name, from, to, x) => { // a line over the road between two paths, at a lane coordinate
@@ -179,8 +182,8 @@ function TopView(svg) {
     svg.setAttribute("viewBox", `${middle - width / 2} ${-centre - height / 2} ${width} ${height}`);
     for (const [who, name] of vehicles.entries()) {
       const { x, y, angle } = places[who], v = vs[who], a = (v[next] - v[k]) / DT;
-      const { group, brake, label } = cars[name];
-      group.setAttribute("transform", `translate(${x} ${-y}) rotate(${angle}) scale(${larger})`);
+      const { group, outline, brake, label } = cars[name];
+      for (const part of [group, outline]) part.setAttribute("transform", `translate(${x} ${-y}) rotate(${angle}) scale(${larger})`);
       brake.setAttribute("visibility", a < -0.2 ? "visible" : "hidden");
       const up = (who === VUT) === vutAbove, named = who === VUT || who === POV;
       label.setAttribute("x", clamp(x - 2.5, middle - aside, middle + aside));
