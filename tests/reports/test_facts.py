@@ -106,7 +106,7 @@ def test_stand_on_the_first_screen(made):
 
     rule = "A case fails with front bumpers within 6 m when the VUT reaches the merge point."
     assert said("sentence") == [f"180 cases of us23 by the sampler uniform. {rule}"]
-    assert "2 more cases have a contact that this rule does not count" in said("strip")[0]
+    assert "2 more cases with contact: --fail-when unsafe counts them" in said("strip")[0]
     avoided = page.xpath("//div[@class='avoided']//dd/text()")
     assert avoided == ["1", "0", "0", "1", "1"], "by careful, fsm, reg157, rss, and a careful POV"
     none, some, unknown = said("map")
