@@ -19,12 +19,11 @@ from merge_sumo.files import GENERATOR, replace_own
 from merge_sumo.metrics.timeline import timeline
 from merge_sumo.reports.pages import page
 from merge_sumo.reports.report_data import motion_row, packed, player_data
-from merge_sumo.reports.text import change_in_words, comparison_headline
+from merge_sumo.reports.text import change_in_words
 from merge_sumo.road.loader import centre_lines, road_or_shipped
-from merge_sumo.scenario.case import coordinates, described
-from merge_sumo.scenario.scenario import level_name
+from merge_sumo.scenario.case import coordinates
 
-SHOWN = 2000
+SHOWN = 1000
 """Maximum number of cases of a page that are listed, with both motions."""
 PAGE = ".html"
 """Ending of a page; a browser shows a file with another ending as source."""
@@ -71,8 +70,8 @@ def comparison_page(compared: Comparison) -> str:
         styles=("report.css", "tally.css", "comparison.css"),
         scripts=("player.js", "comparison.js") if shown else (),
         compared=compared,
-        headline=comparison_headline(compared),
         change_in_words=change_in_words,
+        outcome_word=outcome_word,
         lists=lists,
         maps=_maps(shown),
         data=_data(compared, shown) if shown else None,
@@ -93,31 +92,30 @@ def _maps(shown: Sequence[tuple[VersionChange, ComparedCase]]) -> dict[tuple[int
 def _data(
     compared: Comparison, shown: Sequence[tuple[VersionChange, ComparedCase]]
 ) -> dict[str, Any]:
-    """Return what the scripts draw: for each case shown both motions, and words on each."""
+    """Return what the scripts draw: two entries of `cases` for each case shown."""
     scenario = shown[0][1].later.case.scenario
     road = road_or_shipped(scenario)
-    pairs, motions = [], {}
-    cases: dict[str, list[Any]] = {}
+    road_lines, motions = centre_lines(road), {}
+    cases: dict[str, list[Any]] = {"index": []}
     for version_change, one in shown:
-        later, sides = version_change.number, []
+        later = version_change.number
         for number, outcome in ((later - 1, one.earlier), (later, one.later)):
-            version, place = compared.versions[number - 1], len(cases.get("index", ()))
+            version, place = compared.versions[number - 1], len(cases["index"])
             motion = version.motion(outcome.index)
             if motion is not None:
                 motions[place] = motion
-            for name, value in motion_row(outcome, motion).items():
-                cases.setdefault(name, []).append(value)
+            told = timeline(outcome, motion, road_lines)
             replay = ""
             if version.folder is not None:
                 replay = command("replay", version.folder, outcome.index, gui=True)
-            words = timeline(outcome, motion, centre_lines(road)).in_a_line
-            side = {"version": f"{number}  {version.vut}", "words": words, "replay": replay}
-            sides.append({"case": place, **side})
-        case = one.later.case
-        title = f"Case {one.later.index} · POV level {level_name(case.level)}, {described(case)}"
-        name = f"{later}-case-{one.later.index}"
-        pairs.append({"title": title, "name": name, "sides": sides})
+            row = {
+                "version": f"{number}  {version.vut}",
+                "result": told.result,
+                "events": [(event.time_s, event.text) for event in told.events],
+                "replay": replay,
+            }
+            for name, value in (motion_row(outcome, motion) | row).items():
+                cases.setdefault(name, []).append(value)
     speeds, offsets = packed(motions)
     cases["offset"] = [offsets.get(place, 0) for place in range(2 * len(shown))]
-    drawn = player_data(scenario, road)
-    return {"pairs": pairs, "cases": cases, "speeds": speeds, **drawn}
+    return {"cases": cases, "speeds": speeds, **player_data(scenario, road)}

@@ -110,16 +110,6 @@ def version_change_headline(version_change: VersionChange) -> str:
     return f"from {later - 1} to {later}: {'; '.join(parts)}"
 
 
-def comparison_headline(compared: Comparison) -> str:
-    """Return the failures of each version, and the worse and better cases, in a sentence.
-
-    Args:
-        compared: the comparison.
-    """
-    counts = " -> ".join(version.summary.counts for version in compared.versions)
-    return "; ".join([counts, *map(version_change_headline, compared.version_changes)])
-
-
 def comparison_summary(compared: Comparison) -> list[str]:
     """Return the failures of each version, and a table of the cases of each change of version.
 

@@ -105,7 +105,7 @@ def test_a_controller_of_the_user_is_run_by_its_host(command_line, tmp_path, mon
     assert re.search(r"case \d+, weaker: safe, margin 0\.\d+ -> safe, margin 0\.\d+\n", said.out)
     said = command_line("rerun", "c.toml", "--vut", "own.py:Lost")
     assert said.code == 1
-    assert ", broke: VUT_ERROR at " in said.out
+    assert ", broke: VUT_ERROR: " in said.out
     edit(tmp_path / "c.toml", "},\n", ', accepted = "never mind"},\n', 40)
     assert ms.rerun("c.toml", vut="own.py:Lost").broke == 40, "no error is accepted"
 

@@ -26,7 +26,7 @@ from merge_sumo.errors import UserError
 from merge_sumo.metrics.measures import Measures
 from merge_sumo.metrics.outcome import Episode, Outcome
 from merge_sumo.reports import comparison_page as pages
-from merge_sumo.reports.text import change_in_words, comparison_headline
+from merge_sumo.reports.text import change_in_words
 from merge_sumo.scenario.case import Case, from_unit
 from merge_sumo.scenario.scenario import US23
 from merge_sumo.scenario.trajectory import End
@@ -140,10 +140,10 @@ def test_three_versions_are_two_changes(tmp_path):
         1,
         0,
     ]
-    assert comparison_headline(found) == (
-        "0 failures in 1 case -> 1 failure (0 contacts) in 1 case -> 0 failures in 1 case; from 1 "
-        "to 2: of 1 shared case 1 worse, 0 better; from 2 to 3: of 1 shared case 0 worse, 1 better"
-    )
+    assert [line for line in found.lines() if line.startswith("from ")] == [
+        "from 1 to 2: of 1 shared case 1 worse, 0 better",
+        "from 2 to 3: of 1 shared case 0 worse, 1 better",
+    ]
 
 
 def test_what_does_not_compare_is_refused(tmp_path, run):
