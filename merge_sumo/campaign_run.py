@@ -29,7 +29,7 @@ from merge_sumo.reports.campaign_table import campaign_lines, labelled
 from merge_sumo.reports.comparison_page import AGAINST_PAGE
 from merge_sumo.reports.facts import Fact, facts_of
 from merge_sumo.reports.figures import draw_case, draw_map, maps_picture, require
-from merge_sumo.reports.text import comparison_summary, episode_lines
+from merge_sumo.reports.text import comparison_summary, episode_lines, timelines
 from merge_sumo.result import Result
 from merge_sumo.road.loader import centre_lines, road_for
 from merge_sumo.road.scenario_file import SUFFIX
@@ -187,17 +187,20 @@ class CampaignRun(Result):
         return draw_map(at_level, self.recorded.scenario.dimensions(level), axes)
 
     def plot_case(self, index: int, axes: Axes | None = None) -> Axes:
-        """Draw the positions of all cars of a case over time, and return the axes.
+        """Draw the positions of all cars of a case over time, with its timeline.
 
         Args:
             index: index of the case.
             axes: axes of matplotlib to draw into; None for a new figure.
 
+        Returns:
+            The axes.
+
         Raises:
             UserError: the campaign has no such case, or matplotlib is not installed.
         """
-        title = f"case {index}: {self.recorded.outcome(index).measures.result}"
-        return draw_case(self.trajectory(index), title, axes)
+        told = timelines(self.recorded, [self.recorded.outcome(index)])[index]
+        return draw_case(self.trajectory(index), told, axes)
 
     def _repr_html_(self) -> str:
         """Return the lines, and the maps of all levels side by side."""

@@ -29,6 +29,7 @@ from merge_sumo.errors import UserError
 from merge_sumo.files import check_new, write_new
 from merge_sumo.metrics.fmc import RADIUS
 from merge_sumo.metrics.outcome import Outcome
+from merge_sumo.metrics.timeline import Timeline
 from merge_sumo.records import to_json
 from merge_sumo.reports.pages import X_AXIS, page
 from merge_sumo.reports.text import table_ii
@@ -38,6 +39,7 @@ from merge_sumo.scenario.case import FloatArray
 from merge_sumo.scenario.scenario import (
     COLOURS,
     DT_S,
+    NAMES,
     OWN,
     US23,
     VEHICLES,
@@ -317,7 +319,7 @@ def _band(axes: Axes, values: FloatArray, level: int) -> None:
 def _axes(axes: Axes | None) -> Axes:
     """Return given axes, or those of a new figure that a notebook shows."""
     if axes is None:
-        _, axes = require("matplotlib.pyplot").subplots(layout="constrained")
+        _, axes = require("matplotlib.pyplot").subplots(figsize=(8, 5), layout="constrained")
     return axes
 
 
@@ -364,12 +366,12 @@ def maps_picture(draw: Callable[[int, Axes], Axes], levels: Sequence[int]) -> st
     return f'<img alt="A map of the cases of each POV level" src="data:image/png;base64,{data}">'
 
 
-def draw_case(trajectory: Trajectory, title: str, axes: Axes | None = None) -> Axes:
-    """Draw the positions of all cars over time.
+def draw_case(trajectory: Trajectory, told: Timeline, axes: Axes | None = None) -> Axes:
+    """Draw the positions of all cars over time, with the numbered events of the case.
 
     Args:
         trajectory: the motion.
-        title: title of the axes.
+        told: the timeline of the case.
         axes: axes to draw into; None for a new figure.
 
     Returns:
@@ -378,9 +380,16 @@ def draw_case(trajectory: Trajectory, title: str, axes: Axes | None = None) -> A
     axes = _axes(axes)
     for name, x_m in zip(VEHICLES, trajectory.whole[:, :, 0].T, strict=False):
         times_s = DT_S * np.arange(len(x_m))
-        axes.plot(times_s, x_m, color=COLOURS[name], label=name.upper())
-    axes.axhline(0.0, color="gray", lw=0.8)
-    axes.set(title=title, xlabel="time, s", ylabel=X_AXIS)
+        axes.plot(times_s, x_m, color=COLOURS[name], label=NAMES[name])
+    below, top = ["time, s"], axes.get_xaxis_transform()
+    for number, event in enumerate(told.events, start=1):
+        below.append(f"{number}  {event.time_s:.1f} s  {event.text}")
+        axes.axvline(event.time_s, color="gray", lw=0.8, ls=":")
+        height = 1.01 + 0.05 * (number % 3)  # so that near ones stand apart
+        axes.text(event.time_s, height, str(number), ha="center", transform=top)
+    axes.set_xlabel("\n".join(below), loc="left", fontsize="small")
+    axes.set_ylabel(X_AXIS)
+    axes.set_title(told.result, pad=36.0)
     axes.legend(frameon=False)
     return axes
 

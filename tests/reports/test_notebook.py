@@ -11,6 +11,7 @@ from support.handmade import write_run
 
 import merge_sumo as ms
 from merge_sumo.errors import UserError
+from merge_sumo.reports.text import timelines
 
 
 @pytest.fixture(scope="module")
@@ -32,12 +33,16 @@ def test_a_data_frame_has_each_case_at_its_index_and_a_map_its_start(run):
         run.plot_map(3)
 
 
-def test_a_case_is_drawn_over_time(run):
+def test_a_case_is_drawn_over_time_with_its_events(run):
     axes = run.plot_case(4, Figure().subplots())
     motion = run.trajectory(4).whole
     for line, x_m in zip(axes.lines, motion[:, :, 0].T, strict=False):
         assert line.get_ydata().tolist() == x_m.tolist()
         assert line.get_xdata()[-1] == pytest.approx(0.1 * (len(x_m) - 1))
+    events = timelines(run.recorded, [run.outcomes[4]])[4].events
+    last = f"{len(events)}  {events[-1].time_s:.1f} s  {events[-1].text}"
+    assert [line.get_xdata()[0] for line in axes.lines[2:]] == [one.time_s for one in events]
+    assert axes.get_xlabel().splitlines()[-1] == last
 
 
 def test_html_has_maps_or_says_what_is_missing(run, monkeypatch):
