@@ -55,8 +55,6 @@ SCENARIO = "scenario"
 """Key of the scenario in `CASE`."""
 SHAPE = 614.0 / 1270.0
 """Height of the view in the window of sumo-gui, as a share of its width."""
-REAL_TIME_MS = "1000"
-"""Delay of sumo-gui for each simulated second: SUMO 1.28 counts it so."""
 HOLD_STEPS = 10
 """Number of rows of a record that repeat the last one, so that the last picture stays."""
 UNIT = "unit"
@@ -67,10 +65,58 @@ TEXT = "text"
 """Parameter of a point of interest that sumo-gui shows."""
 PALE = "0.93,0.93,0.90"
 """Red, green and blue of the background, from 0 to 1."""
-ROAD_COLOUR = "0.79,0.78,0.76"
-"""Red, green and blue of lanes, as in the report."""
 INK = "0.1,0.1,0.1"
 """Red, green and blue of texts."""
+CONFIGURATION = """
+<configuration>
+    <net-file value="{net}"/>
+    <additional-files value="{types},{labels}"/>
+    <begin value="0"/>
+    <end value="{end}"/>
+    <step-length value="{step}"/>
+    <collision.action value="none"/>
+    <insertion-checks value="none"/>
+    <time-to-teleport value="-1"/>
+    <default.speeddev value="0"/>
+    <device.fcd-replay.files value="{record}"/>
+    <no-warnings value="true"/>
+    <xml-validation value="never"/>
+    <gui-settings-file value="{view}"/>
+    <start value="true"/>
+    <!-- For each simulated second: SUMO 1.28 counts it so. -->
+    <delay value="1000"/>
+    <!-- Of the speeds. -->
+    <precision value="1"/>
+    <!-- sumo-gui halts there. At the end it would show a dialog over the last picture. -->
+    <breakpoints value="{last}"/>
+    <window-size value="1280,800"/>
+</configuration>
+"""
+"""Configuration of SUMO, which plays in real time and stops at the last picture."""
+VIEW_SETTINGS = """
+<viewsettings>
+    <scheme name="merge">
+        <edges laneShowBorders="1" showLinkDecals="0" showLinkRules="0">
+            <!-- The colour of the report's roads. -->
+            <colorScheme name="uniform"><entry name="road" color="0.79,0.78,0.76"/></colorScheme>
+        </edges>
+        <!-- It shows the value by which it would scale a car: that is the speed, at a scale of 1.
+             The size of names, which are not shown, is how far the speed stands above its car. -->
+        <vehicles vehicleQuality="3" vehicle_exaggeration="1" vehicleScaleMode="2"
+            vehicleScaleValue_show="1" vehicleScaleValue_size="60" vehicleScaleValue_color="{ink}"
+            vehicleScaleValue_constantSize="1" vehicleScaleValue_bgColor="{pale}"
+            vehicleName_size="90">
+            <scalingScheme name="by speed"><entry threshold="0" color="1"/></scalingScheme>
+        </vehicles>
+        <pois poiTextParam="{label}" poiText_show="1" poiText_size="60" poiText_color="{ink}"
+            poiText_constantSize="1" poiText_bgColor="{pale}"/>
+        <background backgroundColor="{pale}" showGrid="0"/>
+    </scheme>
+    <viewport zoom="{zoom}" x="{x}" y="{y}"/>
+    <delay value="1000"/>
+</viewsettings>
+"""
+"""Settings of sumo-gui for a view."""
 FIRST_LINE_UP = 0.465
 """Distance of the first line of the labels from the middle, as a share of the view's height."""
 LINE_DOWN = 0.035
@@ -276,45 +322,8 @@ def view_settings(view: View) -> etree._Element:
     Args:
         view: the view.
     """
-    root = etree.Element("viewsettings")
-    scheme = etree.SubElement(root, "scheme", name="merge")
-    edges = etree.SubElement(
-        scheme, "edges", laneShowBorders="1", showLinkDecals="0", showLinkRules="0"
-    )
-    uniform = etree.SubElement(edges, "colorScheme", name="uniform")
-    etree.SubElement(uniform, "entry", name="road", color=ROAD_COLOUR)
-    cars = etree.SubElement(
-        scheme,
-        "vehicles",
-        vehicleQuality="3",
-        vehicle_exaggeration="1",
-        # It shows the value by which it would scale a car: that is the speed, at a scale of 1.
-        vehicleScaleMode="2",
-        vehicleScaleValue_show="1",
-        vehicleScaleValue_size="60",
-        vehicleScaleValue_color=INK,
-        vehicleScaleValue_constantSize="1",
-        vehicleScaleValue_bgColor=PALE,
-        # The speed stands this far above the car.
-        vehicleName_size="90",
-    )
-    by_speed = etree.SubElement(cars, "scalingScheme", name="by speed")
-    etree.SubElement(by_speed, "entry", threshold="0", color="1")
-    etree.SubElement(
-        scheme,
-        "pois",
-        poiTextParam=TEXT,
-        poiText_show="1",
-        poiText_size="60",
-        poiText_color=INK,
-        poiText_constantSize="1",
-        poiText_bgColor=PALE,
-    )
-    etree.SubElement(scheme, "background", backgroundColor=PALE, showGrid="0")
-    x, y = f"{view.x_m:g}", f"{view.y_m:g}"
-    etree.SubElement(root, "viewport", zoom=view.zoom, x=x, y=y)
-    etree.SubElement(root, "delay", value=REAL_TIME_MS)
-    return root
+    place = {"zoom": view.zoom, "x": f"{view.x_m:g}", "y": f"{view.y_m:g}"}
+    return _parsed(VIEW_SETTINGS, ink=INK, pale=PALE, label=TEXT, **place)
 
 
 def _view_of(road: Road, record: etree._Element) -> View:
@@ -341,31 +350,15 @@ def _box(points: Sequence[tuple[float, float]]) -> tuple[float, FloatArray]:
 
 def _config(timesteps: int) -> etree._Element:
     end_s = timesteps * DT_S
-    options = {
-        "net-file": NET,
-        "additional-files": f"{TYPES},{LABELS}",
-        "begin": "0",
-        "end": f"{end_s:.1f}",
-        "step-length": f"{DT_S}",
-        "collision.action": "none",
-        "insertion-checks": "none",
-        "time-to-teleport": "-1",
-        "default.speeddev": "0",
-        "device.fcd-replay.files": RECORD,
-        "no-warnings": "true",
-        "xml-validation": "never",
-        "gui-settings-file": VIEW,
-        "start": "true",
-        "delay": REAL_TIME_MS,
-        "precision": "1",  # of the speeds
-        # sumo-gui halts there. At the end it would show a dialog over the last picture.
-        "breakpoints": f"{end_s - 2.0 * DT_S:.1f}",
-        "window-size": "1280,800",
-    }
-    root = etree.Element("configuration")
-    for name, value in options.items():
-        etree.SubElement(root, name, value=value)
-    return root
+    times = {"end": f"{end_s:.1f}", "last": f"{end_s - 2.0 * DT_S:.1f}", "step": f"{DT_S}"}
+    files = {"net": NET, "types": TYPES, "labels": LABELS, "record": RECORD, "view": VIEW}
+    return _parsed(CONFIGURATION, **times, **files)
+
+
+def _parsed(text: str, **values: str) -> etree._Element:
+    """Return the XML of a text with a value in the place of each name in braces."""
+    parser = etree.XMLParser(remove_blank_text=True, remove_comments=True)
+    return etree.fromstring(text.format(**values), parser)
 
 
 def _labels(outcome: Outcome, told: Timeline, view: View) -> etree._Element:
