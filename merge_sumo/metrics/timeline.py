@@ -188,7 +188,7 @@ def _ends(
 ) -> Iterator[Event]:
     """Yield merge, contact and what follows; by the last one in time a failure breaks the rule."""
     found, scenario, contact_s = outcome.measures, outcome.case.scenario, None
-    text, car, impact = message_of(outcome), found.nearest, ""
+    text, car = message_of(outcome), found.nearest
     if found.end is End.MERGED:
         text = f"the VUT reaches {scenario.goal}"
         if found.lane_share is not None:
@@ -198,9 +198,11 @@ def _ends(
     if trajectory is not None and found.impact_speed_mps is not None:
         row = Conflict.of(trajectory, lines).row
         contact_s, car = _time_s(row), VEHICLES[trajectory.nearest_at(row)]
-        impact = f"contact at {found.impact_speed_mps:.1f} m/s"
+        impact = f"at {found.impact_speed_mps:.1f} m/s"
+        if contact_s != found.t_end_s:
+            yield Event(contact_s, f"contact with the {NAMES[car]} {impact}", car)
     if contact_s == found.t_end_s:
-        text += f": {impact}"
+        text += f": contact {impact}"
     elif rule == PAPER:
         text += f": closer than {scenario.dx_crash_m:g} m"
     elif rule is not None and contact_s is None:
@@ -208,8 +210,6 @@ def _ends(
         text += f": braking of {needed:.1f} m/s2 must follow" if needed else ": too near to brake"
     if rule in (None, PAPER) or contact_s is None or contact_s >= found.t_end_s:
         yield Event(found.t_end_s, text, found.nearest)
-    if contact_s not in (None, found.t_end_s):
-        yield Event(contact_s, impact, car)
     if trajectory is None:
         return
     hardest_mps2 = found.after_brake_mps2

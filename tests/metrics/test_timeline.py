@@ -121,7 +121,7 @@ class TestTheTimelineOfAFailure:
         assert found.result == "squeeze, contact at 3.9 m/s"
         assert events(found)[-2:] == [
             "8.0 s   the VUT reaches the merge point 5.2 m ahead of the POV: closer than 6 m",
-            "8.1 s   contact at 3.9 m/s",
+            "8.1 s   contact with the POV at 3.9 m/s",
         ]
 
     def test_goes_on_to_the_braking_that_the_merge_asks_for(self):

@@ -167,13 +167,14 @@ def check_event(text: str, row: int, m: Motion) -> None:
 
 def check_moment(text: str, row: int, m: Motion) -> None:
     """Check all that an event says that is no phase and no merge."""
-    if found := re.fullmatch(rf"contact at {NUMBER} m/s", text):
+    if found := re.fullmatch(rf"contact(?: with the {CAR})? at {NUMBER} m/s", text):
         # In the plane, lanes that meet at an angle add to the length and to the difference.
         rows = range(m.end, len(m.whole))
         touch = [r for r in rows if abs(m.apart(r, m.nearest_at(r))) <= LENGTH_M]
         assert row <= min(touch, default=m.end)
+        assert found[1] is None or CARS[found[1]] == m.nearest_at(row)
         assert abs(m.apart(row, m.nearest_at(row))) < LENGTH_M + 0.5
-        assert float(found[1]) >= abs(m.v(row, m.nearest_at(row)) - m.v(row, 1)) - 0.06
+        assert float(found[2]) >= abs(m.v(row, m.nearest_at(row)) - m.v(row, 1)) - 0.06
     elif found := re.fullmatch(rf"the {CAR} brakes hardest after the merge: {NUMBER} m/s2", text):
         near(found[2], m.whole[row][CARS[found[1]]][2])
         assert row >= m.end
