@@ -191,6 +191,7 @@ def test_errors_and_timeouts_are_drawn_as_no_result_shown_first_and_grouped(brow
         assert page.inner_text("#case-words").startswith("VUT_ERROR")
         assert page.locator("#case-timeline li").last.inner_text().endswith("boom")
         page.locator(".lists [data-case='3']").click()
+        assert "Does not fail" not in page.inner_text("#case-words")
         assert page.inner_text("#case-words").startswith("Timeout")
         last = page.locator("#case-timeline li").last.inner_text()
         assert "the VUT did not reach the merge point in" in last

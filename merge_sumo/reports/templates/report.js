@@ -43,7 +43,7 @@ function title(i) {
   return `Case ${cases.index[i]} · POV level ${data.level_names[cases.level[i]]}, ${place.join(", ")}`;
 }
 function words(i) {
-  const margin = cases.margin[i] === null ? "" : `${undecided(i) ? "Undecided" : failed(i) ? "Fails" : "Does not fail"}: margin ${cases.margin[i]}.`;
+  const margin = cases.margin[i] === null || !tested(i) ? "" : `${undecided(i) ? "Undecided" : failed(i) ? "Fails" : "Does not fail"}: margin ${cases.margin[i]}.`;
   const { [i]: result } = cases.result;
   return [`${result[0].toUpperCase()}${result.slice(1)}.`, margin, runsInWords(i)].filter(Boolean).join(" ");
 }
