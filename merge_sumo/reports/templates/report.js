@@ -159,9 +159,10 @@ function FailureMap(figure) {
       const off = (mark) => Math.hypot(mark.x - x, mark.y - y);
       const at = inside.reduce((best, mark) => (off(mark) < off(best) ? mark : best));
       const side = at.x > left + width - 24 ? -1 : 1, spot = { x: at.x + side * 10, y: clamp(at.y + 4, top + 11, top + height - 3) };
-      if (taken.some(({ x, y }) => Math.abs(x - spot.x) < 12 && Math.abs(y - spot.y) < 11)) continue; // a slice, or a click in the list, shows it
-      taken.push(spot);
-      draw(svg, "text", { class: "named number", x: spot.x, y: spot.y, "text-anchor": side < 0 ? "end" : "start" }, String(region.number + 1));
+      const beside = taken.find(({ x, y }) => Math.abs(x - spot.x) < 14 && Math.abs(y - spot.y) < 11);
+      if (beside) { beside.text.textContent += `, ${region.number + 1}`; continue; }
+      const text = draw(svg, "text", { class: "named number", ...spot, "text-anchor": side < 0 ? "end" : "start" }, String(region.number + 1));
+      taken.push({ ...spot, text });
     }
   };
   const counts = () => { // of a long campaign: the cases that are not listed one by one
