@@ -367,7 +367,7 @@ def maps_picture(draw: Callable[[int, Axes], Axes], levels: Sequence[int]) -> st
 
 
 def draw_case(trajectory: Trajectory, told: Timeline, axes: Axes | None = None) -> Axes:
-    """Draw the positions of all cars over time, with the numbered events of the case.
+    """Draw the positions of all cars over time, with the events of the case.
 
     Args:
         trajectory: the motion.
@@ -381,15 +381,12 @@ def draw_case(trajectory: Trajectory, told: Timeline, axes: Axes | None = None) 
     for name, x_m in zip(VEHICLES, trajectory.whole[:, :, 0].T, strict=False):
         times_s = DT_S * np.arange(len(x_m))
         axes.plot(times_s, x_m, color=COLOURS[name], label=NAMES[name])
-    below, top = ["time, s"], axes.get_xaxis_transform()
-    for number, event in enumerate(told.events, start=1):
-        below.append(f"{number}  {event.time_s:.1f} s  {event.text}")
+    below = ["time, s"]
+    for event in told.events:
+        below.append(f"{event.time_s:.1f} s  {event.text}")
         axes.axvline(event.time_s, color="gray", lw=0.8, ls=":")
-        height = 1.01 + 0.05 * (number % 3)  # so that near ones stand apart
-        axes.text(event.time_s, height, str(number), ha="center", transform=top)
     axes.set_xlabel("\n".join(below), loc="left", fontsize="small")
-    axes.set_ylabel(X_AXIS)
-    axes.set_title(told.result, pad=36.0)
+    axes.set(ylabel=X_AXIS, title=told.result)
     axes.legend(frameon=False)
     return axes
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import subprocess
 import sys
 
-import pandas
 import pytest
 from lxml import html
 from support.handmade import write_run
@@ -13,7 +12,6 @@ from support.handmade import write_run
 import merge_sumo as ms
 from merge_sumo.errors import UserError
 from merge_sumo.files import DATED, dated
-from merge_sumo.metrics.summary import summarise
 
 
 @pytest.fixture(scope="module")
@@ -27,12 +25,6 @@ def opened(made) -> ms.CampaignRun:
 
 
 class TestARun:
-    def test_gives_its_failures_to_pandas_as_they_are(self, opened, made):
-        frame = pandas.DataFrame(opened.failures)
-        assert len(frame) == summarise(made.outcomes, (0, 1, 2)).failures
-        assert frame["score"].is_monotonic_increasing
-        assert (frame["score"] < -500).all()
-
     def test_shows_its_lines_and_names_as_text(self, opened):
         root = html.fragment_fromstring(opened._repr_html_(), create_parent="div")
         assert root.xpath(".//pre")[0].text.startswith("<b>x</b> on us23")
