@@ -12,9 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from merge_sumo.metrics.bodies import CentreLines
+from merge_sumo.metrics.bodies import NONE_MET, CentreLines, Encounter, encounters
 from merge_sumo.metrics.criterion import CRITERIA, PAPER, condition_of, values_of
-from merge_sumo.metrics.merge import Conflict, Severity
+from merge_sumo.metrics.merge import Severity
 from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.metrics.summary import message_of
 from merge_sumo.scenario.case import Case, FloatArray, described
@@ -112,9 +112,10 @@ def timeline(
         >>> timeline(case.outcome, case.trajectory, None).events[-1].text
         'the VUT reaches the merge point 2.6 m ahead of the POV: contact at 8.2 m/s'
     """
-    found, rule, kind = outcome.measures, _rule(outcome), None
-    ends = [*_ends(outcome, trajectory, lines, rule)]
-    *ends, last = sorted(ends, key=lambda event: event.time_s)
+    found, rule, kind, met = outcome.measures, _rule(outcome), None, NONE_MET
+    if trajectory is not None and found.impact_speed_mps is not None:
+        (met,) = encounters([trajectory], lines)
+    *ends, last = sorted(_ends(outcome, trajectory, met, rule), key=lambda event: event.time_s)
     events = [*ends, *others, *_way_out(outcome)]
     if trajectory is not None:
         events += _phases(outcome, trajectory, {end.car for end in (*ends, last)})
@@ -125,8 +126,9 @@ def timeline(
     result = found.result if found.end.is_error else found.result.lower()
     if outcome.failed:
         result = f"{kind or 'failure'}, {result}"
-    if found.impact_speed_mps is not None:
-        result += f" at {found.impact_speed_mps:.1f} m/s"
+    # Campaigns of earlier versions have recorded the speed at M.
+    if impact_mps := met.impact_mps or found.impact_speed_mps:
+        result += f" at {impact_mps:.1f} m/s"
     return Timeline(tuple(events), result, kind)
 
 
@@ -184,7 +186,7 @@ def _rule(outcome: Outcome) -> str | None:
 
 
 def _ends(
-    outcome: Outcome, trajectory: Trajectory | None, lines: CentreLines | None, rule: str | None
+    outcome: Outcome, trajectory: Trajectory | None, met: Encounter, rule: str | None
 ) -> Iterator[Event]:
     """Yield merge, contact and what follows; by the last one in time a failure breaks the rule."""
     found, scenario, contact_s = outcome.measures, outcome.case.scenario, None
@@ -195,10 +197,9 @@ def _ends(
             text = f"the VUT merges at {found.lane_share:.2f} of the lane,"
         side = "ahead of" if found.merged_first == "VUT" else "behind"
         text += f" {abs(found.dx_m or 0.0):.1f} m {side} the {NAMES[car]}"
-    if trajectory is not None and found.impact_speed_mps is not None:
-        row = Conflict.of(trajectory, lines).row
-        contact_s, car = _time_s(row), VEHICLES[trajectory.nearest_at(row)]
-        impact = f"at {found.impact_speed_mps:.1f} m/s"
+    if trajectory is not None and met.row is not None:
+        contact_s, car = _time_s(met.row), VEHICLES[trajectory.nearest_at(met.row)]
+        impact = f"at {met.impact_mps:.1f} m/s"
         if contact_s != found.t_end_s:
             yield Event(contact_s, f"contact with the {NAMES[car]} {impact}", car)
     if contact_s == found.t_end_s:
