@@ -121,7 +121,7 @@ FIRST_LINE_UP = 0.465
 """Distance of the first line of the labels from the middle, as a share of the view's height."""
 LINE_DOWN = 0.035
 """Distance of two lines, as a share of the view's height."""
-LEGEND_UP = 0.315
+LEGEND_UP = 0.375
 """Distance of the legend from the middle, as a share of the view's height."""
 LEGEND_RIGHT = 0.13
 """Distance of two entries of the legend, as a share of the view's width."""

@@ -114,7 +114,7 @@ def test_a_merge_from_a_lane_is_seen_in_the_row_in_which_it_happens(tmp_path, na
     folder = write_replay(tmp_path / "case", road, trajectory)
     assert_identical(folder, steps + 1)
     share = (trajectory.x_vut_m[-1] - scenario.lane_m[0]) / np.ptp(scenario.lane_m)
-    assert f"the VUT merges at {share:.2f} of the lane" in (folder / LABELS).read_text()
+    assert f"the VUT merges at {share:.2f} of the lane" in "".join(replay(folder).words)
     lanes = [car.get("lane") for car in etree.parse(folder / RECORD).iterfind(".//*[@id='vut']")]
     *before, first = lanes[: steps + 1]
     assert {*lanes[steps:]} == {first}
