@@ -65,18 +65,15 @@ def campaign_lines(run: RecordedCampaign, summary: Summary, facts: Sequence[Fact
     things = {CASES: "case", ERRORS: "error", TIMEOUTS: "timeout"}
     if summary.tested:
         things[FAILURES] = "failure"
-    found = []
-    for name, thing in things.items():
-        if name in of:
-            found.append(_counted(of[name], thing))
+    found = [_counted(of[name], thing) for name, thing in things.items() if name in of]
     if not summary.tested:
         found.append("nothing tested")
     if summary.undecided:
         found.append(f"{of[UNDECIDED].shown} undecided")
     head = f"{of[VUT].shown} on {run.scenario.name}: {', '.join(found)}"
     rule = f"({of[RULE].shown})"
-    between = " " if len(head) + len(rule) < LINE_CHARACTERS else "\n"
-    lines = [*f"{head}{between}{rule}".split("\n"), ""]
+    is_short = len(head) + len(rule) < LINE_CHARACTERS
+    lines = [f"{head} {rule}", ""] if is_short else [head, rule, ""]
     shares = {fact.level: fact.shown for fact in facts if fact.name == STARTS_THAT_FAIL}
     if summary.levels:
         lines += [*aligned(level_table(summary, shares), left=1 + bool(shares)), ""]
