@@ -1,13 +1,13 @@
-"""Make the pictures of README and of the site, and the folders of scenarios/, from today's tool.
+"""Make the pictures of README and the site, the notebook and scenarios/ from today's tool.
 
     xvfb-run -a python tools/make_pictures.py            each whose text is no longer the tool's
     xvfb-run -a python tools/make_pictures.py NAME ...   these
     python tools/make_pictures.py --check                none; name them, and end with 1
 
 A PNG holds the text that it shows as its "Description": texts tell whether it is today's, and no
-pixels. A drawing is compared as a whole; its template is in `tools/drawings/`. The report needs
-Chromium (`apt-get install chromium`). Pictures of sumo-gui need a display, for which `xvfb-run`
-stands above.
+pixels. A drawing is compared as a whole; its template is in `tools/drawings/`. The notebook is
+compared by the texts of its cells. The report needs Chromium (`apt-get install chromium`). Pictures
+of sumo-gui need a display, for which `xvfb-run` stands above.
 """
 
 from __future__ import annotations
@@ -33,6 +33,7 @@ from matplotlib.figure import Figure
 from matplotlib.text import Text
 from PIL import Image, PngImagePlugin
 from playwright.sync_api import Page, ViewportSize, sync_playwright
+from run_notebook import executed, shown, write, written
 from scenario_examples import EXAMPLES, motion_figure, play
 
 from merge_sumo import config
@@ -235,6 +236,18 @@ def room(name: str) -> str:
     return f"{name}/" if path.is_dir() else name
 
 
+def notebook(new: Path | None) -> str:
+    """Execute the notebook of the documentation.
+
+    Args:
+        new: new file; None for the text alone.
+    """
+    cells = executed()
+    if new:
+        write(cells, new)
+    return shown(cells)
+
+
 def scenario_folder(name: str, new: Path | None) -> str:
     """Write an example as a replay folder.
 
@@ -263,6 +276,7 @@ MAKERS: dict[str, Maker] = {
     "scenarios/roundabout.png": partial(gui_picture, "roundabout-stalemate", 8.5),
     "scenarios/curves-level1.png": curves_picture,
     "scenarios/report.png": report_picture,
+    "docs/tutorials/notebook.ipynb": notebook,
 }
 """How each picture is made, by its path in the checkout."""
 
@@ -291,13 +305,15 @@ def stored_text(path: Path) -> str:
     """Return the text of a picture of the checkout, "" where there is none.
 
     Args:
-        path: a PNG, a drawing, or a folder of a scenario.
+        path: a PNG, a drawing, a notebook, or a folder of a scenario.
     """
     if path.is_dir():
         files = [file for file in sorted(path.iterdir()) if file.suffix != ".png"]
         return "\n".join(f"{file.name}\n{file.read_text(encoding='utf-8')}" for file in files)
     if not path.exists():
         return ""
+    if path.suffix == ".ipynb":
+        return shown(written(path))
     if path.suffix == ".svg":
         return path.read_text(encoding="utf-8")
     with Image.open(path) as image:
@@ -325,7 +341,7 @@ def make(name: str) -> None:
         text = MAKERS[name](new)
         if new.is_dir():
             shutil.copytree(new, ROOT / name, dirs_exist_ok=True)
-        elif new.suffix == ".svg":
+        elif new.suffix != ".png":
             shutil.copyfile(new, ROOT / name)
         else:
             (ROOT / name).write_bytes(described_png(new, text))

@@ -1,17 +1,13 @@
-"""Execute the notebook of the documentation.
-
-    python tools/run_notebook.py --write    write the outputs of today's tool into the notebook
-
-A test executes it as well, and compares what its cells show with what the file shows.
-"""
+"""The notebook of the documentation, which `tools/make_pictures.py` executes."""
 
 from __future__ import annotations
 
 import re
-import sys
 import tempfile
 from pathlib import Path
 from typing import Any
+
+import nbformat
 
 NOTEBOOK = Path(__file__).resolve().parent.parent / "docs" / "tutorials" / "notebook.ipynb"
 PICTURE = re.compile(r"base64,[\w+/=]+")
@@ -23,17 +19,35 @@ def executed(path: Path = NOTEBOOK) -> Any:
     Args:
         path: the notebook.
     """
-    import nbformat
     from nbclient import NotebookClient
 
-    notebook = nbformat.read(path, as_version=4)
+    notebook = written(path)
     with tempfile.TemporaryDirectory() as folder:
         place: dict[str, Any] = {"metadata": {"path": folder}}
         NotebookClient(notebook, resources=place, record_timing=False).execute()
     return notebook
 
 
-def shown(notebook: Any) -> list[str]:
+def write(notebook: Any, path: Path) -> None:
+    """Write a notebook with the outputs of its cells.
+
+    Args:
+        notebook: the notebook.
+        path: its file.
+    """
+    nbformat.write(notebook, path)
+
+
+def written(path: Path) -> Any:
+    """Return the notebook of a file.
+
+    Args:
+        path: the file.
+    """
+    return nbformat.read(path, as_version=4)
+
+
+def shown(notebook: Any) -> str:
     """Return the texts that the cells show, without their pictures.
 
     Args:
@@ -47,12 +61,4 @@ def shown(notebook: Any) -> list[str]:
             html = data.get("text/html", "")
             if html.startswith("<pre>"):  # of this package: that of pandas changes with its version
                 texts.append(PICTURE.sub("", html))
-    return texts
-
-
-if __name__ == "__main__":
-    if sys.argv[1:] != ["--write"]:
-        sys.exit("say --write to write the outputs of its cells into the notebook")
-    import nbformat as nbf
-
-    nbf.write(executed(), NOTEBOOK)
+    return "\n".join(filter(None, texts))

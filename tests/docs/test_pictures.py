@@ -15,7 +15,7 @@ NEEDS_CHROMIUM = "chromium is not on the PATH"
 
 
 def test_the_command_makes_each_picture_of_a_page_and_no_other():
-    made = {name for name in MAKERS if (ROOT / name).is_file()}
+    made = {name for name in MAKERS if name.endswith((".png", ".svg"))}
     assert made == make_pictures.pictures_on_pages()
     sizes = [(ROOT / name).stat().st_size for name in made]
     assert 2_000 < min(sizes) < max(sizes) < 200_000
