@@ -4,6 +4,8 @@ The second calculation is plain Python over the numbers of the trajectory, witho
 the measures. An unknown event fails the test.
 """
 
+# mypy: no-strict-optional
+
 from __future__ import annotations
 
 import re
