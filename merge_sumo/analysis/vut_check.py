@@ -171,12 +171,10 @@ def _standstill_faults(simulator: Simulator, from_standstill: Case) -> list[str]
 
 def _notes(plan: SimulationPlan, driven: Sequence[Trajectory]) -> list[str]:
     """Return sentences on behaviour that is no fault, but may surprise the author of the VUT."""
-    outcomes = []
     in_vain: Counter[str] = Counter()
-    for index, trajectory in enumerate(driven):
-        outcomes.append(plan.criterion.outcome(trajectory, index=index))
+    for trajectory in driven:
         in_vain.update(trajectory.in_vain)
-    return doubts(outcomes, in_vain)
+    return doubts(plan.criterion.outcomes(driven, None), in_vain)
 
 
 def _ordinary_cases(scenario: Scenario) -> list[Case]:

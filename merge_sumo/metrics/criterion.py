@@ -7,7 +7,7 @@ of lambda under the criterion of the paper.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -19,6 +19,7 @@ from merge_sumo.metrics.measures import (
     MEASURES,
     Measures,
     known_measures,
+    measures_of,
     recorded_measures,
 )
 from merge_sumo.metrics.merge import Severity
@@ -177,40 +178,56 @@ class Criterion:
         condition = condition_of(self.condition)
         return condition.margin(values_of(measures, condition.names))
 
-    def outcome(
-        self, trajectory: Trajectory, lines: CentreLines | None = None, index: int = 0
-    ) -> Outcome:
-        """Return the outcome of an episode outside of campaigns.
+    def outcomes(
+        self, trajectories: Sequence[Trajectory], lines: CentreLines | None
+    ) -> list[Outcome]:
+        """Return the outcomes of episodes of one scenario, in one batch.
 
         A measure is calculated when it is first read.
 
         Args:
-            trajectory: the motion.
-            lines: centre lines of the road; None for no clearance before M.
-            index: index of the case.
+            trajectories: the motions.
+            lines: centre lines of the road; None for none before M.
         """
-        measures = Measures(trajectory, lines)
-        margin = self.margin(trajectory, measures)
-        return Outcome(index=index, batch=0, case=trajectory.case, measures=measures, margin=margin)
+        outcomes = []
+        measured = measures_of(trajectories, lines)
+        for index, (trajectory, measures) in enumerate(zip(trajectories, measured, strict=True)):
+            margin = self.margin(trajectory, measures)
+            outcomes.append(Outcome(index, 0, trajectory.case, measures, margin=margin))
+        return outcomes
 
-    def is_close_call(
-        self, trajectory: Trajectory, rounding: float, lines: CentreLines | None = None
-    ) -> bool:
-        """Return whether a rounding error in the motion could change the verdict.
+    def outcome(self, trajectory: Trajectory, lines: CentreLines | None = None) -> Outcome:
+        """Return the outcome of an episode outside of campaigns.
 
         Args:
             trajectory: the motion.
+            lines: centre lines of the road; None for none before M.
+        """
+        return self.outcomes([trajectory], lines)[0]
+
+    def close_calls(
+        self, trajectories: Sequence[Trajectory], rounding: float, lines: CentreLines
+    ) -> set[int]:
+        """Return the indices where a rounding error in the motion could change the verdict.
+
+        Args:
+            trajectories: the motions.
             rounding: largest rounding error of a position, m.
             lines: centre lines of the road.
         """
+        found = set()
         if self.is_of_paper:
-            x_m = trajectory.motion[-1, :, 0]
-            distance_m = abs(x_m[trajectory.nearest] - x_m[VUT])
-            from_limit_m = abs(distance_m - trajectory.case.scenario.dx_crash_m)
-            return bool(from_limit_m <= rounding)
-        margin = self.outcome(trajectory, lines).margin
-        # A margin has no unit. The same number serves: it is 100,000 times the measured error.
-        return margin is not None and abs(margin) <= rounding
+            for index, trajectory in enumerate(trajectories):
+                x_m = trajectory.motion[-1, :, 0]
+                distance_m = abs(x_m[trajectory.nearest] - x_m[VUT])
+                if abs(distance_m - trajectory.case.scenario.dx_crash_m) <= rounding:
+                    found.add(index)
+            return found
+        for outcome in self.outcomes(trajectories, lines):
+            # A margin has no unit. The same number serves: it is 100,000 times the measured error.
+            if outcome.margin is not None and abs(outcome.margin) <= rounding:
+                found.add(outcome.index)
+        return found
 
 
 PAPER_CRITERION = Criterion()

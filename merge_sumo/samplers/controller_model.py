@@ -190,15 +190,16 @@ class ModelRollout:
         steps = self.scenario.max_steps
         motion = np.zeros((steps + 1, self.scenario.vehicles, 3, len(cases)))
         gaps_m, last = self._play(points, drives, motion)
-        gaps = np.empty(len(cases))
+        trajectories = []
         for row, case in enumerate(cases):
             of_row = motion[: last[row] + 1, :, :, row].copy()
             end, after = End.TIMEOUT, None
             if not np.isnan(gaps_m[row]):
                 end, after = End.MERGED, self._follow_up(of_row[-1])
-            trajectory = Trajectory(case, of_row, end, after=after)
-            gaps[row] = self._criterion.outcome(trajectory, self._lines).signed_gap
-        return gaps.reshape(len(drives), -1)
+            trajectories.append(Trajectory(case, of_row, end, after=after))
+        outcomes = self._criterion.outcomes(trajectories, self._lines)
+        gaps = [outcome.signed_gap for outcome in outcomes]
+        return np.array(gaps, dtype=np.float64).reshape(len(drives), -1)
 
     def _follow_up(self, at_m: FloatArray) -> FloatArray | None:
         """Predict the motion after a state at M, (A, 3): all keep their speeds for a reaction."""

@@ -16,8 +16,7 @@ import numpy as np
 
 from merge_sumo.errors import UserError
 from merge_sumo.files import hashed
-from merge_sumo.metrics.measures import measures_of
-from merge_sumo.metrics.outcome import Episode, Outcome
+from merge_sumo.metrics.outcome import Episode
 from merge_sumo.road.loader import centre_lines
 from merge_sumo.scenario.case import Case
 from merge_sumo.scenario.trajectory import End, Trajectory
@@ -67,7 +66,7 @@ def simulate_part(
         trajectories = simulator.run(cases)
         files, pov_files = hashed(simulator.vut.files()), hashed(simulator.pov.files())
         parts = []
-        for outcome in _outcomes(plan, trajectories):
+        for outcome in plan.criterion.outcomes(trajectories, centre_lines(plan.road)):
             index = outcome.index
             episode = Episode(
                 outcome,
@@ -104,7 +103,7 @@ def lost_episode(plan: SimulationPlan, case: Case) -> Episode:
     start = [[(x, v, 0.0) for x, v in case.starts()]]
     error = "its worker process died twice"
     trajectory = Trajectory(case, np.array(start), End.SIM_ERROR, error)
-    (outcome,) = _outcomes(plan, [trajectory])
+    outcome = plan.criterion.outcome(trajectory)
     episode = Episode(outcome, trajectory)
     return episode if plan.against is None else replace(episode, earlier=episode)
 
@@ -198,16 +197,6 @@ def close_simulator() -> None:
 def _key(plan: SimulationPlan) -> tuple[object, ...]:
     """Return the key of the simulator that serves a plan."""
     return plan.key(), plan.vut, plan.povs, plan.engine, plan.corridors, plan.substeps
-
-
-def _outcomes(plan: SimulationPlan, trajectories: Sequence[Trajectory]) -> list[Outcome]:
-    """Return the outcomes of trajectories; only the measures that judge them are computed."""
-    measured = measures_of(trajectories, centre_lines(plan.road))
-    outcomes = []
-    for index, (trajectory, measures) in enumerate(zip(trajectories, measured, strict=True)):
-        margin = plan.criterion.margin(trajectory, measures)
-        outcomes.append(Outcome(index, 0, trajectory.case, measures, margin=margin))
-    return outcomes
 
 
 def _simulate_both(

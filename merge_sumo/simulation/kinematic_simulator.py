@@ -102,10 +102,7 @@ class KinematicSimulator(Simulator):
         for place_m in (0.0, *(self._plan.scenario.lane_m or ())):
             unclear |= (np.abs(x_vut_m - place_m) <= ROUNDING).any(axis=1)
         close, lines = set(np.flatnonzero(unclear).tolist()), centre_lines(self._plan.road)
-        for index, one in enumerate(ended):
-            if index not in close and self._plan.criterion.is_close_call(one, ROUNDING, lines):
-                close.add(index)
-        return close
+        return close | self._plan.criterion.close_calls(ended, ROUNDING, lines)
 
     def _compare(self, kinematic: Trajectory, sumo: Trajectory) -> None:
         """Raise `UserError` where a case ended otherwise in SUMO."""

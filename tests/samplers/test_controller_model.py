@@ -88,7 +88,7 @@ class TestRollouts:
         assert len(drives) < US23.max_steps / 2
 
     @pytest.mark.parametrize(
-        "text", ["unsafe or before_clearance_m < 0", 'pet_s < 2.5 or end == "TIMEOUT"']
+        "text", ["unsafe or before_clearance_m < 3", 'pet_s < 2.5 or end == "TIMEOUT"']
     )
     def test_are_judged_as_cases_are(self, text, tmp_path):
         (tmp_path / "slows.py").write_text(SLOWS)
