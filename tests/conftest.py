@@ -23,8 +23,6 @@ from merge_sumo.campaigns.recorded import RecordedCampaign
 from merge_sumo.road.road import Road
 from merge_sumo.simulation import evaluate
 
-MOUNT, UMOUNT = shutil.which("mount"), shutil.which("umount")
-
 
 def pytest_configure() -> None:
     """Let linear algebra have one thread in each process: tests run on all cores."""
@@ -133,22 +131,6 @@ def call(monkeypatch, tmp_path, command_line) -> Callable[..., Said]:
     """Return what runs the command line, from a folder of its own."""
     monkeypatch.chdir(tmp_path)
     return command_line
-
-
-@pytest.fixture
-def small_disk(tmp_path):
-    """Mount a file system of 256 kB."""
-    require(os.geteuid() == 0 and MOUNT is not None, "mounting needs root")
-    disk = tmp_path / "disk"
-    disk.mkdir()
-    done = subprocess.run(
-        [MOUNT, "-t", "tmpfs", "-o", "size=256k", "tmpfs", str(disk)],
-        capture_output=True,
-        check=False,
-    )
-    require(done.returncode == 0, f"mount: {done.stderr.decode().strip()}")
-    yield disk
-    subprocess.run([UMOUNT, "--lazy", str(disk)], check=True)
 
 
 @pytest.hookimpl(wrapper=True)

@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import os
 import shutil
@@ -151,24 +150,6 @@ class TestTwoProcessesOnOneFolder:
             resume_campaign(folder)
         assert contents(folder) == before
         resume_campaign(folder)
-
-
-class TestADisk:
-    def test_that_becomes_full_ends_in_a_sentence_and_loses_nothing(
-        self, whole, folder, small_disk
-    ):
-        run = Path(shutil.copytree(folder, small_disk / "run"))
-        before = outcomes(run)
-        free = shutil.disk_usage(small_disk).free
-        # Room for outcomes, and not for the trajectories of a batch.
-        (small_disk / "others").write_bytes(bytes(free - 12_288))
-        with pytest.raises(UserError, match=r"cannot write .*No space left on device.*--resume"):
-            resume_campaign(run)
-        assert outcomes(run) == before
-        (small_disk / "others").unlink()
-        with contextlib.suppress(UserError):
-            resume_campaign(run)  # the scenarios may not fit
-        assert outcomes(run) == outcomes(whole)
 
 
 class TestASignal:

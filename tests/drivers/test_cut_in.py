@@ -76,7 +76,6 @@ class CutIns:
 
     Attributes:
         crash_type: 0 none, 1 with ego's centre ahead, 2 with ego behind, (n,).
-        most_pfs, most_cfs: the largest metrics of FSM, (n,).
     """
 
     def __init__(self, name, ego_kmh, other_kmh, gap_m, lateral_mps):
@@ -85,8 +84,7 @@ class CutIns:
         unique, which = np.unique(lateral_mps, return_inverse=True)
         self.y_m, self.u_mps, before = (found[..., which] for found in lateral(unique))
         n, v = len(gap_m), ego_kmh / 3.6
-        self.crash_type = np.zeros(n, dtype=int)
-        self.most_pfs, self.most_cfs, self.ended = np.zeros(n), np.zeros(n), np.zeros(n, bool)
+        self.crash_type, self.ended = np.zeros(n, dtype=int), np.zeros(n, dtype=bool)
         reaction, a = Reaction(n, self.model), np.zeros(n)
         d = gap_m + (v - self.v_other) * before * DT_S
         for step in range(STEPS):
@@ -118,15 +116,7 @@ class CutIns:
             return unsafe & (y < 0.3 + (2.0 * u + 0.75) * 0.75 / 2.0 + (u + 0.75) ** 2 / 2.0)
         with np.errstate(divide="ignore", invalid="ignore"):
             in_time = y / u <= (d + 2.0 * LENGTH_M) / (v - self.v_other) + 0.1
-        near = (y <= 0.0) | ((u > 0.0) & in_time)
-        sees = near & (d + LENGTH_M >= 0.0)
-        pfs, cfs = (
-            FsmModel().pfs(Pair(d, v, self.v_other)),
-            FsmModel().cfs(Pair(d, v, self.v_other, a)),
-        )
-        self.most_pfs = np.maximum(self.most_pfs, np.where(sees, pfs, 0.0))
-        self.most_cfs = np.maximum(self.most_cfs, np.where(sees, cfs, 0.0))
-        return unsafe & near
+        return unsafe & ((y <= 0.0) | ((u > 0.0) & in_time))
 
 
 def test_pfs_is_that_of_the_published_code():
@@ -152,6 +142,3 @@ def test_every_cut_in_ends_as_with_the_published_code(name):
     assert len(wanted) == 584
     assert 50 < (wanted > 0).sum() < 500
     assert np.flatnonzero(found.crash_type != wanted).tolist() == []
-    if name == "FSM":
-        assert np.abs(found.most_pfs - rows["max_pfs"].astype(float)).max() < 1e-9
-        assert np.abs(found.most_cfs - rows["max_cfs"].astype(float)).max() < 1e-9

@@ -16,7 +16,6 @@ from merge_sumo.drivers.reference_drivers import (
     CarefulVut,
     FsmVut,
     Reg157Vut,
-    RssVut,
 )
 from merge_sumo.scenario.case import Case
 from merge_sumo.scenario.scenario import DT_S, US23, Scenario
@@ -42,27 +41,12 @@ def answers(driver, seen, steps):
 
 
 class TestRampDrivers:
-    def test_fsm_waits_and_brakes_by_its_jerk(self):
-        found = answers(started(FsmVut), at_m(0.0), 13)
-        assert found == [0.0] * 8 + [-1.265, -2.53, -3.795, -4.0, -4.0]
-
     def test_the_careful_driver_waits_until_a_collision_is_less_than_2_s_away(self):
         assert answers(started(CarefulVut), at_m(0.0), 13) == [0.0] * 13
         # Perceived for the first time: 0.4 s and 0.75 s, with the pedal released.
         near = scene_of(-36.0, 20.0, -55.9, 28.0)
         found = answers(started(CarefulVut, Scenario(a_min_mps2=-9.0)), near, 15)
         assert found == [-0.4] * 12 + [-1.665, -2.93, -4.195]
-
-    def test_reg157_reacts_when_it_would_just_stop_before_m(self):
-        # 0.35 * 28 + 28^2 / 8 = 107.8 m.
-        assert answers(started(Reg157Vut), at_m(0.0, x_vut_m=-107.9), 6) == [0.0] * 6
-        found = answers(started(Reg157Vut), at_m(0.0, x_vut_m=-107.7), 6)
-        assert found == [0.0] * 4 + [-4.0] * 2
-
-    def test_rss_reacts_within_its_own_distance_of_m(self):
-        # R = 0.75 + 4 / 25.3: 28 R + R^2 + (28 + 2 R)^2 / 8 = 137.7 m.
-        assert answers(started(RssVut), at_m(0.0, x_vut_m=-138.2), 10) == [0.0] * 10
-        assert answers(started(RssVut), at_m(0.0, x_vut_m=-137.0), 10)[-1] == -2.53
 
     def test_an_episode_begins_with_the_delay(self):
         fsm = started(FsmVut)

@@ -11,9 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from metrics.test_score import CASE, ending
-from support.campaigning import campaign_settings, run_campaign
 
-from merge_sumo.campaigns.recorded import RecordedCampaign
 from merge_sumo.errors import UserError
 from merge_sumo.metrics.bodies import SPACING_M, CentreLines, encounters
 from merge_sumo.metrics.criterion import PAPER_CRITERION, Criterion, vocabulary
@@ -105,6 +103,7 @@ class TestParsing:
             ("ttc_s", "is not a condition"),
             ("end == TIMEOUT", "no measure 'TIMEOUT' (a text is in quotes)"),
             ("ttc_s < True", "neither a measure"),
+            ("ttc_s < 2 && dx_m > 3", "with and, or, not and comparisons as in Python"),
             ('__import__("os").system("true")', "is not a condition"),
             ("ttc_s < 1\0", "is not an expression"),
             ("(" * 500, "is not an expression"),
@@ -180,18 +179,13 @@ class TestNamed:
     def test_may_be_part_of_a_condition(self):
         either = Criterion('unsafe or end == "TIMEOUT"')
         assert either.as_written == "unsafe or end == 'TIMEOUT'"
+        # 20 m and 10 m/s: 4 m/s2, a third beyond 3.
         hard = ending(-25.0, v_pov=36.0, v_vut=26.0)
         assert of(either.as_written, hard) == pytest.approx(-1.0 / 3.0)
         assert of(either.as_written, ending(9.0, end=End.TIMEOUT)) == -1.0
-        assert of("not (contact or paper)", ending(-25.0, v_pov=27.0)) < 0.0
+        assert of("not (contact or unsafe)", ending(-25.0, v_pov=27.0)) < 0.0
         with pytest.raises(UserError, match="did you mean unsafe"):
             Criterion("unsave or ttc_s < 1")
-
-    def test_unsafe_is_also_who_must_brake_harder_than_3(self):
-        # 20 m and 10 m/s: 4 m/s2, a third beyond 3.
-        harsh = Criterion("unsafe").outcome(ending(-25.0, v_pov=36.0, v_vut=26.0))
-        assert harsh.margin == pytest.approx(-1.0 / 3.0)
-        assert not Criterion("unsafe").outcome(ending(-25.0, v_pov=27.0)).failed
 
 
 def lines(apart_m, ends_m=-20.0):
@@ -255,11 +249,6 @@ class TestBodiesBeforeM:
         unknown = Measures.of(Trajectory(CASE, merged, End.MERGED))
         assert (unknown.severity, unknown.clearance_m) == ("safe", 85.0)
 
-    def test_that_cross_meet_at_the_speed_of_one_relative_to_the_other(self):
-        motion = np.array([[[2.0, 3.0, 0.0], [-0.5, 4.0, 0.0]]])
-        (met,) = encounters([Trajectory(CASE, motion, End.TIMEOUT)], lines_that_cross())
-        assert met.impact_mps == 5.0
-
 
 class TestOutcomes:
     @pytest.mark.parametrize("margin", [True, "1", math.nan])
@@ -275,12 +264,6 @@ class TestOutcomes:
         assert criterion.outcome(ending(20.0, v_pov=16.0)).signed_gap == pytest.approx(1.0 / 1.5)
         assert PAPER_CRITERION.outcome(ending(-21.0)).signed_gap == pytest.approx(-3.5)
 
-
-def test_a_campaign_by_a_condition_on_the_score_is_that_of_the_paper_and_read_back(tmp_path):
-    for name, fail_when in (("paper", "paper"), ("mine", "score < -500")):
-        settings = campaign_settings(vut="design1", cases=20, batch=20, fail_when=fail_when)
-        run_campaign(settings, tmp_path / name)
-    assert (
-        RecordedCampaign(tmp_path / "mine").outcomes
-        == RecordedCampaign(tmp_path / "paper").outcomes
-    )
+    def test_of_a_condition_that_is_that_of_the_paper_are_those_of_the_paper(self):
+        found = Criterion("score < -500").outcome(ending(3.0))
+        assert found == PAPER_CRITERION.outcome(ending(3.0))

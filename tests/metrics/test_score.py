@@ -4,7 +4,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 
 import numpy as np
@@ -168,9 +167,3 @@ class TestMeasures:
         assert measures.is_close
         assert (measures.avoidable, measures.last_avoidable_s) == (False, None)
         assert Measures.of(ending(30.0)).avoidable is None
-
-
-def test_outcomes_round_trip_through_their_record():
-    for trajectory in (ending(3.0), ending(30.0), eq4(-250.0, 30.0, 0.0, -182.0, 0.0, 0.0)):
-        outcome = Outcome(7, 2, CASE, Measures.of(trajectory))
-        assert Outcome.from_json(json.dumps(outcome.to_record()), scenario=US23) == outcome

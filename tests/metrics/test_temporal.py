@@ -14,7 +14,7 @@ from metrics.test_score import CASE, ending
 from merge_sumo.errors import UserError
 from merge_sumo.metrics.criterion import Criterion
 from merge_sumo.metrics.expression import MOST_MARGIN
-from merge_sumo.metrics.temporal import NEVER_S, SIGNALS, check_formula, robustness, signals
+from merge_sumo.metrics.temporal import NEVER_S, SIGNALS, check_formula, signals
 from merge_sumo.scenario.scenario import US23
 from merge_sumo.scenario.trajectory import End, Trajectory
 
@@ -95,17 +95,6 @@ class TestFormulas:
         with pytest.raises(UserError, match="calculates with infinity"):
             Criterion(require=text).check(US23)
 
-    @pytest.mark.parametrize(
-        ("text", "margin"),
-        [
-            ("always[20:30] (v_vut_mps > 2)", MOST_MARGIN),
-            ("eventually[20:30] (v_vut_mps > 2)", -MOST_MARGIN),
-        ],
-    )
-    def test_over_a_time_after_the_end_hold_for_no_step(self, rtamt, text, margin):
-        motion = np.array([[[-40.0, 30.0, 0.0], [-20.0, 20.0, 0.0]], [[8.0, 20.0, 0.0]] * 2])
-        assert robustness(text, Trajectory(CASE, motion, End.MERGED)) == margin
-
     def test_go_without_a_condition(self):
         with pytest.raises(UserError, match="choose one"):
             Criterion("contact", NEAR)
@@ -127,6 +116,9 @@ class TestRobustness:
             ("eventually (x_vut_m > 0)", 1.0),  # 1 m past M at the end, 2.6 m a step
             ("always[0:0.5] (x_vut_m < -10)", 2.0),
             ("always (v_vut_mps > 1000)", -MOST_MARGIN),
+            # After the end they hold for no step.
+            ("always[20:30] (v_vut_mps > 2)", MOST_MARGIN),
+            ("eventually[20:30] (v_vut_mps > 2)", -MOST_MARGIN),
         ],
     )
     def test_is_the_margin(self, formula, margin):

@@ -135,13 +135,6 @@ class TestThePlan:
 class TestATruth:
     PLAN = plan_for("design2").with_engine(None)
 
-    def test_is_that_of_sumo(self, tmp_path):
-        ours = ground_truth(self.PLAN, 1, 1000, cache=tmp_path)
-        sumos = ground_truth(plan_for("design2"), 1, 1000, cache=tmp_path)
-        assert (ours.margin < 0.0).tolist() == (sumos.margin < 0.0).tolist()
-        np.testing.assert_allclose(ours.margin, sumos.margin, rtol=0.0, atol=1e-9)
-        assert (ours.in_sumo, sumos.in_sumo) == (10, 1000)
-
     def test_is_kept_by_engine(self, tmp_path):
         counted: list[int] = []
         ground_truth(self.PLAN, 0, 50, cache=tmp_path, on_case=counted.append)
