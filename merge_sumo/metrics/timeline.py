@@ -166,18 +166,21 @@ def _phases(outcome: Outcome, trajectory: Trajectory, met: set[Vehicle | None]) 
 
 def _way_out(outcome: Outcome) -> Iterator[Event]:
     """Yield until when the VUT could keep its distance at M."""
-    last_s, scenario = outcome.measures.last_avoidable_s, outcome.case.scenario
-    if outcome.failed and last_s is not None:
-        yield Event(last_s, "last way out: full braking or full acceleration")
-    elif outcome.failed and outcome.measures.is_close:
+    found, scenario = outcome.measures, outcome.case.scenario
+    text = "last way out: full braking or full acceleration"
+    if found.last_avoidable_s is None:
         kept = f"{scenario.dx_crash_m:g} m at {scenario.place}"
-        yield Event(0.0, f"no way out: neither full braking nor full acceleration keeps {kept}")
+        text = f"no way out: neither full braking nor full acceleration keeps {kept}"
+    if outcome.failed and found.is_close:
+        yield Event(found.last_avoidable_s or 0.0, text)
 
 
 def _rule(outcome: Outcome) -> str | None:
     """Return the named criterion by which a case fails; None without one."""
-    if not outcome.failed or outcome.is_by_score:
-        return PAPER if outcome.failed else None
+    if not outcome.failed:
+        return None
+    if outcome.is_by_score:
+        return PAPER
     for name, criterion in CRITERIA.items():
         condition = condition_of(criterion.condition)
         if condition.margin(values_of(outcome.measures, condition.names)) == outcome.margin:
