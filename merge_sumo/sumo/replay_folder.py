@@ -357,7 +357,7 @@ def _config(timesteps: int) -> etree._Element:
 
 def _parsed(text: str, **values: str) -> etree._Element:
     """Return the XML of a text with a value in the place of each name in braces."""
-    parser = etree.XMLParser(remove_blank_text=True, remove_comments=True)
+    parser = etree.XMLParser(resolve_entities=False, remove_blank_text=True, remove_comments=True)
     return etree.fromstring(text.format(**values), parser)
 
 
