@@ -15,6 +15,7 @@ from lxml import etree, html
 from support.calling import assert_refused
 from support.campaigning import campaign_settings, run_campaign
 from support.handmade import drive
+from support.histories import ended
 
 from merge_sumo.analysis.comparison import Change, ComparedCase, compare
 from merge_sumo.analysis.rerun import rerun
@@ -35,14 +36,9 @@ CASE = Case(level=0, x_pov0_m=-273.0, v_pov0_mps=33.0, scenario=US23)
 Point = tuple[float, float, str]
 
 
-def outcome(severity: str | None, score: float | None, end: End = End.MERGED) -> Outcome:
-    return Outcome(0, 0, CASE, Measures(end=end, score=score, t_end_s=8.0, severity=severity))
-
-
-SAFE, HARSH = outcome("safe", -20.0), outcome("harsh", -20.0)
-CONTACT, TOUCHES = outcome("contact", -600.0), outcome("contact", -20.0)
-TIMEOUT = outcome(None, -1.0, End.TIMEOUT)
-ERROR = outcome(None, None, End.VUT_ERROR)
+SAFE, HARSH = (ended(CASE, -20.0, severity=severity) for severity in ("safe", "harsh"))
+CONTACT, TOUCHES = (ended(CASE, score, severity="contact") for score in (-600.0, -20.0))
+TIMEOUT, ERROR = ended(CASE, -1.0, end=End.TIMEOUT), ended(CASE, None)
 
 
 @pytest.mark.parametrize(
@@ -181,11 +177,10 @@ def test_bad_use_of_rerun_is_refused(command_line, run, arguments, part):
 
 def runs(failing: int, count: int) -> list[Outcome]:
     """Return runs of a case, the failing ones first."""
-    scores = [-600.0 if draw < failing else -20.0 for draw in range(count)]
     made = []
-    for draw, score in enumerate(scores):
-        measures = Measures(end=End.MERGED, score=score, t_end_s=8.0, dx_m=score + draw)
-        made.append(Outcome(draw, 0, replace(CASE, draw=draw), measures))
+    for draw in range(count):
+        score = -600.0 if draw < failing else -20.0
+        made.append(ended(replace(CASE, draw=draw), score, draw, dx_m=score + draw))
     return made
 
 

@@ -8,6 +8,7 @@ from dataclasses import astuple
 
 import numpy as np
 import pytest
+from support.histories import ended
 from support.plans import POVS, plan_for
 from support.vut_contract import factory
 
@@ -21,11 +22,9 @@ from merge_sumo.analysis.truth import Truth, ground_truth, truth_path
 from merge_sumo.controllers.kinds import load
 from merge_sumo.controllers.spec import ControllerOptions
 from merge_sumo.metrics.fmc import fmc
-from merge_sumo.metrics.measures import Measures
 from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.scenario.case import from_unit, to_unit
 from merge_sumo.scenario.scenario import US23
-from merge_sumo.scenario.trajectory import End
 
 
 @pytest.fixture(scope="module")
@@ -105,9 +104,7 @@ def searched(points_by_batch: list[list[tuple[float, float]]]) -> SamplerRun:
     for batch, points in enumerate(points_by_batch):
         for failed, point in [(False, (0.0, 0.0)), *((True, point) for point in points)]:
             (case,) = from_unit(np.array([point]), 0, scenario=US23)
-            end, score = End.MERGED, -600.0 if failed else -1.0
-            measures = Measures(end=end, score=score, t_end_s=8.3)
-            outcomes.append(Outcome(len(outcomes), batch, case, measures))
+            outcomes.append(ended(case, -600.0 if failed else -1.0, len(outcomes), batch))
         curve.append(fmc(to_unit([o.case for o in outcomes if o.failed], 0, scenario=US23)))
     return SamplerRun(outcomes, curve)
 

@@ -6,16 +6,15 @@ from typing import Any
 
 import pytest
 from support.campaigning import run_campaign
+from support.histories import ended
 
 from merge_sumo import api
 from merge_sumo.campaigns import recorded as campaign_folder
 from merge_sumo.campaigns.recorded import WINDOW, has_converged
 from merge_sumo.campaigns.settings import CampaignSettings
-from merge_sumo.metrics.measures import Measures
 from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.scenario.case import Case
 from merge_sumo.scenario.scenario import US23
-from merge_sumo.scenario.trajectory import End
 
 
 def outcomes(*failing: int, cases: int) -> list[Outcome]:
@@ -24,8 +23,7 @@ def outcomes(*failing: int, cases: int) -> list[Outcome]:
     for place in range(cases):
         x_m = -338.0 + 17.0 * failing.index(place) if place in failing else -181.0
         case = Case(level=0, x_pov0_m=x_m, v_pov0_mps=30.0, scenario=US23)
-        score = -600.0 if place in failing else -1.0
-        ran.append(Outcome(place, place, case, Measures(end=End.MERGED, score=score, t_end_s=8.3)))
+        ran.append(ended(case, -600.0 if place in failing else -1.0, place, place))
     return ran
 
 

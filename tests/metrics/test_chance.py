@@ -11,8 +11,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from support.histories import ended
 
-from merge_sumo.metrics.measures import Measures
 from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.metrics.summary import (
     by_case,
@@ -24,7 +24,6 @@ from merge_sumo.metrics.summary import (
 )
 from merge_sumo.scenario.case import Case, to_unit
 from merge_sumo.scenario.scenario import US23
-from merge_sumo.scenario.trajectory import End
 
 CASE = Case(level=2, x_pov0_m=-273.0, v_pov0_mps=33.0, svo_rad=0.5, scenario=US23)
 FAILS, PASSES = -600.0, -20.0
@@ -34,9 +33,7 @@ def outcomes(runs: Sequence[tuple[Case, int, float | None]]) -> list[Outcome]:
     """Return outcomes of (case, draw, score), without a verdict for None."""
     found = []
     for index, (case, draw, score) in enumerate(runs):
-        end = End.VUT_ERROR if score is None else End.MERGED
-        measures = Measures(end=end, score=score, t_end_s=9.0)
-        found.append(Outcome(index, 0, replace(case, draw=draw), measures))
+        found.append(ended(replace(case, draw=draw), score, index))
     return found
 
 

@@ -4,19 +4,16 @@
 
 from __future__ import annotations
 
-import math
 import statistics
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from conftest import some
-from support.histories import history_of
+from support.histories import ended, history_of
 
 from merge_sumo.metrics.fmc import fmc, radius_for
-from merge_sumo.metrics.measures import Measures
 from merge_sumo.metrics.outcome import Outcome
-from merge_sumo.samplers.base import Sampler
 from merge_sumo.samplers.batch import (
     EVEN_IF_COVERED,
     NEAREST,
@@ -26,37 +23,12 @@ from merge_sumo.samplers.batch import (
     greedy,
     near_miss_limit,
 )
+from merge_sumo.samplers.contract import play, play_case
 from merge_sumo.samplers.coverage_grid import CoverageGrid
 from merge_sumo.samplers.registry import make_sampler
 from merge_sumo.samplers.surrogate import Surrogate, learned_values
-from merge_sumo.scenario.case import Case, Pool, to_unit
+from merge_sumo.scenario.case import Pool, to_unit
 from merge_sumo.scenario.scenario import US23
-from merge_sumo.scenario.trajectory import End
-
-
-def outcome(index: int, batch: int, case: Case, *, fails: bool = True) -> Outcome:
-    """Return what came of a case: a band of gaps below 6 m, unless this level never fails."""
-    x, v = to_unit([case], case.level, scenario=US23)[0, :2].tolist()
-    dx_m = 200.0 * (0.6 * x + 0.8 * v - 0.7) if fails else 80.0
-    overlap_m = 6.0 - abs(dx_m)
-    end = End.MERGED
-    score = -560.0 - 75.0 * overlap_m if overlap_m > 0.0 else -450.0 * math.exp(overlap_m / 15.0)
-    measures = Measures(end=end, score=score, t_end_s=8.3, dx_m=dx_m)
-    return Outcome(index, batch, case, measures)
-
-
-def play(
-    sampler: Sampler, batches: int, n: int = 20, *, level_that_fails: int = -1
-) -> list[Outcome]:
-    outcomes: list[Outcome] = []
-    for batch in range(batches):
-        ran = []
-        for index, case in enumerate(sampler.ask(n), len(outcomes)):
-            fails = level_that_fails in (-1, case.level)
-            ran.append(outcome(index, batch, case, fails=fails))
-        sampler.tell(ran)
-        outcomes += ran
-    return outcomes
 
 
 def coverage_of(outcomes: list[Outcome], level: int) -> float:
@@ -101,7 +73,7 @@ def test_covers_more_than_twice_of_what_uniform_covers():
     for name in ("uniform", "coverage"):
         covered = []
         for seed in (1, 2, 3):
-            outcomes = play(make_sampler(name, pool, seed), 5)
+            outcomes = play(make_sampler(name, pool, seed), 5, 20)
             covered.append(coverage_of(outcomes, 2))
         median[name] = statistics.median(covered)
     assert median["uniform"] > 0.0, "the band must not be invisible"
@@ -121,8 +93,13 @@ def test_takes_a_vut_that_never_arrives_for_one_that_lets_the_pov_go_first():
 
 def test_gives_more_cases_to_the_level_with_more_to_cover_but_starves_none():
     sampler = make_sampler("coverage", Pool(levels=(0, 1, 2), scenario=US23), 4)
-    outcomes = play(sampler, 5, 30, level_that_fails=1)
-    last = [o.case.level for o in outcomes if o.batch == 4]
+    for batch in range(5):
+        ran = []
+        for index, case in enumerate(sampler.ask(30), 30 * batch):
+            passed = ended(case, -1.0, index, batch, dx_m=80.0)
+            ran.append(play_case(index, batch, case) if case.level == 1 else passed)
+        sampler.tell(ran)
+    last = [outcome.case.level for outcome in ran]
     assert last.count(1) == 20, "5 of the half that is shared out evenly, and the other half"
     assert last.count(0) == last.count(2) == 5
 

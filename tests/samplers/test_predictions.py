@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from support.histories import ended
 
-from merge_sumo.metrics.measures import Measures
-from merge_sumo.metrics.outcome import Outcome, Prediction
+from merge_sumo.metrics.outcome import Prediction
 from merge_sumo.samplers.predictions import (
     chance_by_gaps,
     disagreement,
@@ -17,7 +18,6 @@ from merge_sumo.samplers.predictions import (
 )
 from merge_sumo.scenario.case import Case
 from merge_sumo.scenario.scenario import US23
-from merge_sumo.scenario.trajectory import End
 
 CASE = Case(level=0, x_pov0_m=-273.0, v_pov0_mps=33.0, scenario=US23)
 
@@ -25,9 +25,8 @@ CASE = Case(level=0, x_pov0_m=-273.0, v_pov0_mps=33.0, scenario=US23)
 def outcome(*, failed, model=0.5, surrogate=0.5, p_fail=0.5, predicted=True):
     """Return the outcome of a case, by default of a prediction that favours nothing."""
     score, dx_m = (-600.0, 0.0) if failed else (-50.0, 60.0)
-    measures = Measures(end=End.MERGED, score=score, t_end_s=8.3, dx_m=dx_m)
     prediction = Prediction.of(np.zeros(8), model, surrogate, p_fail) if predicted else None
-    return Outcome(0, 0, CASE, measures, prediction)
+    return replace(ended(CASE, score, dx_m=dx_m), prediction=prediction)
 
 
 def test_p_fail_is_the_share_of_members_that_predict_a_failure():

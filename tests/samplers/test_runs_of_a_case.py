@@ -8,15 +8,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from support.histories import ended
 
-from merge_sumo.metrics.measures import Measures
-from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.samplers.history import LevelHistory
 from merge_sumo.samplers.registry import make_sampler
 from merge_sumo.samplers.surrogate import Surrogate
 from merge_sumo.scenario.case import Case, Pool
 from merge_sumo.scenario.scenario import US23
-from merge_sumo.scenario.trajectory import End
 
 CASE = Case(level=0, x_pov0_m=-260.0, v_pov0_mps=30.0, scenario=US23)
 OTHER = replace(CASE, v_pov0_mps=31.0)
@@ -26,17 +24,8 @@ def history_of_runs(*runs: tuple[Case, int, float, float], tolerated: float = 0.
     """Return the history of runs (case, draw, score, dx)."""
     sampler = make_sampler("uniform", Pool(levels=(0,), scenario=US23), 0)
     sampler.tolerated = tolerated
-    sampler.tell(
-        [
-            Outcome(
-                index,
-                index,
-                replace(case, draw=draw),
-                Measures(end=End.MERGED, score=score, t_end_s=9.0, dx_m=dx_m),
-            )
-            for index, (case, draw, score, dx_m) in enumerate(runs)
-        ]
-    )
+    for index, (case, draw, score, dx_m) in enumerate(runs):
+        sampler.tell([ended(replace(case, draw=draw), score, index, index, dx_m=dx_m)])
     return sampler.history(0)
 
 

@@ -9,14 +9,12 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from support.histories import ended
 
-from merge_sumo.metrics.measures import Measures
-from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.samplers.registry import SAMPLERS, make_sampler
 from merge_sumo.samplers.uniform import UniformSampler
 from merge_sumo.scenario.case import Pool, to_unit
 from merge_sumo.scenario.scenario import US23
-from merge_sumo.scenario.trajectory import End
 from merge_sumo.testing.contracts import SamplerContract, play
 
 TRAFFIC = replace(US23, headway_ahead_s=(1.0, 4.0), headway_behind_s=(1.0, 3.0))
@@ -103,8 +101,7 @@ def test_gpr_shares_by_the_failures_of_the_last_batch_of_each_level():
     # Level, batch and score: half of the last batch of level 1 fails, none of level 0.
     runs = [(0, 0, -5.0), (1, 0, -5.0), (1, 1, -700.0), (1, 1, -5.0), (0, 2, -5.0)]
     for index, (level, batch, score) in enumerate(runs):
-        measures = Measures(end=End.MERGED, score=score, t_end_s=8.3)
-        sampler.tell([Outcome(index, batch, cases[level], measures)])
+        sampler.tell([ended(cases[level], score, index, batch)])
     levels = [case.level for case in sampler.ask(20)]
     # exp(3 / 2) : 1 over 20 cases is 16.35 : 3.65.
     assert (levels.count(0), levels.count(1)) == (4, 16)

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from support.histories import ended
 
-from merge_sumo.metrics.measures import Measures
 from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.samplers.coverage import CoverageSampler
 from merge_sumo.scenario.case import FloatArray, Pool, to_unit
 from merge_sumo.scenario.scenario import US23
-from merge_sumo.scenario.trajectory import End
 
 
 def band_m(points: FloatArray) -> FloatArray:
@@ -52,14 +52,13 @@ def search(true_m, cases: int, seed: int) -> tuple[FloatArray, NDArray[np.bool_]
     while len(done) < cases:
         asked = sampler.ask(sampler.batch_size())
         gaps = true_m(to_unit(asked, 0, scenario=US23)).tolist()
-        ended = []
+        ran = []
         for place, (case, dx_m) in enumerate(zip(asked, gaps, strict=True)):
             score = -600.0 if abs(dx_m) < US23.dx_crash_m else -50.0
-            measures = Measures(end=End.MERGED, score=score, t_end_s=8.3, dx_m=dx_m)
-            index = len(done) + place
-            ended.append(Outcome(index, len(done), case, measures, sampler.prediction(place)))
-        sampler.tell(ended, {})
-        done += ended
+            one = ended(case, score, len(done) + place, len(done), dx_m=dx_m)
+            ran.append(replace(one, prediction=sampler.prediction(place)))
+        sampler.tell(ran, {})
+        done += ran
     points = to_unit([outcome.case for outcome in done], 0, scenario=US23)
     return points, np.array([outcome.failed for outcome in done])
 

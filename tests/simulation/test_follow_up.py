@@ -10,10 +10,8 @@ import numpy as np
 import pytest
 from metrics.test_score import CASE, ending
 from support.handmade import FOLLOWED_UP
-from support.plans import plan_for
+from support.vut_contract import in_process, run_cases
 
-from merge_sumo.controllers.kinds import load
-from merge_sumo.controllers.spec import ControllerOptions
 from merge_sumo.errors import UserError
 from merge_sumo.metrics.criterion import Criterion
 from merge_sumo.metrics.measures import Measures
@@ -21,7 +19,6 @@ from merge_sumo.metrics.timeline import timeline
 from merge_sumo.scenario.case import Pool
 from merge_sumo.scenario.scenario import US23, VUT
 from merge_sumo.scenario.trajectory import End
-from merge_sumo.simulation.simulator import Simulator
 
 FOLLOWED, AT_M = US23, replace(US23, follow_up_s=0.0)
 CASES = Pool(levels=(0,), scenario=FOLLOWED).cases(np.random.default_rng(3).random((12, 2)), 0)
@@ -67,9 +64,7 @@ class TestMeasures:
 def run(vut, scenario):
     """Return the trajectories of the cases in a scenario."""
     cases = [replace(case, scenario=scenario) for case in CASES]
-    factory = load(vut, ControllerOptions(in_process=True))
-    with Simulator(plan_for(factory, scenario=scenario, corridors=5)) as ground:
-        return ground.run(cases)
+    return run_cases(in_process(vut), cases, corridors=5)
 
 
 @pytest.mark.parametrize(("braking", "severity"), [(-3.1, "harsh"), (-2.9, "safe")])

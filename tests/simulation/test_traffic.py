@@ -6,17 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.plans import plan_for
+from support.vut_contract import factory, run_cases
 
 from merge_sumo.controllers.controller import seen_in
-from merge_sumo.controllers.kinds import load
-from merge_sumo.controllers.spec import ControllerOptions
 from merge_sumo.drivers.car_following import conflicting_car, keep_safe, safe_speed_mps
 from merge_sumo.metrics.measures import Measures
 from merge_sumo.scenario.case import Case, Pool, from_unit, to_unit
 from merge_sumo.scenario.scenario import AHEAD, BEHIND, DT_S, POV, US23, Scenario
 from merge_sumo.scenario.trajectory import End, Trajectory
-from merge_sumo.simulation.simulator import Simulator
 from merge_sumo.sumo.binding import load_libsumo
 from merge_sumo.sumo.sumo_simulation import SumoSimulation
 
@@ -29,12 +26,6 @@ def cases_of(level: int, n: int, scenario: Scenario = TRAFFIC, seed: int = 0) ->
     rng = np.random.default_rng([seed, level])
     points = rng.random((n, len(scenario.dimensions(level))))
     return Pool(levels=(level,), scenario=scenario).cases(points, level)
-
-
-def run(vut: str, cases: list[Case], corridors: int = 16, **options) -> list[Trajectory]:
-    factory = load(vut, ControllerOptions(**options))
-    with Simulator(plan_for(factory, scenario=cases[0].scenario, corridors=corridors)) as ground:
-        return ground.run(cases)
 
 
 def test_the_cars_start_at_their_headways_and_the_speed_of_the_pov():
@@ -62,10 +53,10 @@ def test_the_safe_speed_is_that_of_sumos_original_krauss_model():
 class TestCarsOfTheMainline:
     @pytest.mark.parametrize("level", [0, 1, 2])
     def test_that_are_far_away_change_nothing(self, level):
-        alone, far = cases_of(level, 60, US23), []
+        vut, alone, far = factory("design2"), cases_of(level, 60, US23), []
         for case in alone:
             far.append(replace(case, scenario=TRAFFIC, headway_ahead_s=18.0, headway_behind_s=16.0))
-        for one, other in zip(run("design2", alone), run("design2", far), strict=True):
+        for one, other in zip(run_cases(vut, alone), run_cases(vut, far), strict=True):
             assert np.array_equal(one.motion, other.motion[:, :2])
             assert one.end == other.end
             assert Measures.of(other).score == Measures.of(one).score

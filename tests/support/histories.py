@@ -1,4 +1,4 @@
-"""Outcomes of a level as arrays, for tests of samplers."""
+"""Outcomes without motions, one by one and of a level as arrays."""
 
 from __future__ import annotations
 
@@ -7,9 +7,22 @@ from typing import Any
 
 import numpy as np
 
+from merge_sumo.metrics.measures import Measures
+from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.samplers.history import LevelHistory
+from merge_sumo.scenario.case import Case
+from merge_sumo.scenario.trajectory import End
 
 FloatArray = np.ndarray
+
+
+def ended(
+    case: Case, score: float | None, index: int = 0, batch: int = 0, **measures: Any
+) -> Outcome:
+    """Return what came of a case; without a score, an error of the VUT."""
+    end = End.VUT_ERROR if score is None else End.MERGED
+    known = {"end": end, "score": score, "t_end_s": 8.3, **measures}
+    return Outcome(index, batch, case, Measures(**known))
 
 
 def history_of(points: FloatArray, margin: FloatArray, **columns: Any) -> LevelHistory:

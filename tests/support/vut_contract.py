@@ -57,8 +57,9 @@ def in_process(spec: object, **options: Any) -> ControllerKind:
 
 
 def run_cases(vut: ControllerKind, cases: list[Case], corridors: int = 8) -> list[Trajectory]:
-    """Return what became of every case, in order."""
-    with Simulator(plan_for(vut, corridors=corridors)) as ground:
+    """Return what became of every case of a scenario, in order."""
+    plan = plan_for(vut, scenario=cases[0].scenario, corridors=corridors)
+    with Simulator(plan) as ground:
         return ground.run(cases)
 
 
@@ -67,6 +68,4 @@ def run_on(
 ) -> list[Trajectory]:
     """Return what became of some cases of a scenario, in order."""
     points = np.random.default_rng(0).random((count, len(scenario.dimensions(level))))
-    cases = from_unit(points, level, scenario=scenario)
-    with Simulator(plan_for(vut, scenario=scenario, corridors=corridors)) as ground:
-        return ground.run(cases)
+    return run_cases(vut, from_unit(points, level, scenario=scenario), corridors)
