@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
-
 import pytest
 from lxml import html
 from support.handmade import write_run
@@ -41,14 +38,6 @@ class TestACampaign:
         first, second = (folder / "outcomes.jsonl" for folder in (run.folder, again.folder))
         assert first.read_bytes() == second.read_bytes()
         assert (again.folder / "report.html").is_file()
-
-
-def test_the_import_costs_nothing():
-    script = "import sys, merge_sumo as ms; dir(ms); print('numpy' in sys.modules)"
-    done = subprocess.run(
-        [sys.executable, "-c", script], capture_output=True, text=True, check=True
-    )
-    assert done.stdout.split() == ["False"]
 
 
 def test_a_name_that_is_not_there_is_an_attribute_error():

@@ -46,7 +46,9 @@ def test_a_text_of_another_user_stays_a_text(call, name, honest, tmp_path):
     for index in (7, 39):
         lines[index] = json.dumps(json.loads(lines[index]) | {"error": text})
     (folder / OUTCOMES).write_text("\n".join(lines) + "\n")
-    (folder / SETTINGS).write_text(json.dumps(read_settings(folder) | {"vut": text}))
+    (folder / SETTINGS).write_text(
+        json.dumps(read_settings(folder) | {"vut": text, "sampler": text})
+    )
     (folder / LOG).write_text(text)
 
     code, out, err = call("report", folder)

@@ -60,7 +60,7 @@ CASE = meeting(KEEP, GOES).case
 BRAKES = parts((3.0, 0.0), (5.0, -1.0), (3.0, 0.0))
 LATE = parts((7.0, 1.0), (1.0, -4.0), (3.0, 0.0))
 EASES = parts((2.0, 1.0), (6.0, -0.5), (3.0, 0.0))
-AHEAD = "8.0 s   the VUT reaches the merge point 9.0 m ahead of the POV"
+REACHES = "8.0 s   the VUT reaches the merge point"
 MEETS = "the VUT reaches the merge point 1.0 m behind the POV: contact at"
 
 
@@ -110,40 +110,52 @@ class TestTheTimelineOfAFailure:
         assert f"0.0 s   {never}" in events(found)
         assert found.kind == "late brake"
 
-    def test_says_that_front_bumpers_were_closer_than_6_m(self):
-        (*_, last) = events(told(meeting(KEEP, GOES, gap_m=5.5)))
-        assert (
-            last == "8.0 s   the VUT reaches the merge point 5.5 m behind the POV: closer than 6 m"
-        )
-
-    def test_goes_on_to_a_contact_after_m(self):
-        found = told(meeting(KEEP, GOES, gap_m=-5.2))
-        assert found.result == "squeeze, contact at 3.9 m/s"
-        assert events(found)[-2:] == [
-            "8.0 s   the VUT reaches the merge point 5.2 m ahead of the POV: closer than 6 m",
-            "8.1 s   contact with the POV at 3.9 m/s",
-        ]
-
-    def test_goes_on_to_the_braking_that_the_merge_asks_for(self):
-        stops = parts((8.1, 0.0), (1.0, -4.0), (3.0, 0.0))
-        found = told(meeting(stops, GOES, gap_m=-9.0), "unsafe")
-        assert found.result == "cut in, harsh"
-        assert events(found)[-3:] == [
-            f"{AHEAD}: braking of 8.0 m/s2 must follow",
-            "8.1 s   the POV brakes: 30.0 to 26.0 m/s",
-            "8.1 s   the POV brakes hardest after the merge: -4.0 m/s2",
-        ]
-
-    def test_by_a_rule_of_the_user_ends_with_its_margin(self):
-        found = told(meeting(KEEP, GOES, gap_m=30.0), "t_end_s > 4")
-        assert found.result == "rule broken, safe"
-        assert events(found)[-1] == "11.0 s   fails: margin -1"
-
-    def test_of_a_timeout_says_what_it_did_not_reach(self):
-        trajectory = replace(meeting(KEEP, GOES), end=End.TIMEOUT, after=None)
-        found = told(trajectory, 'end == "TIMEOUT"')
-        assert found.result == "did not arrive, timeout"
-        assert events(found)[-1] == "8.0 s   the VUT did not reach the merge point in 8 s"
+    @pytest.mark.parametrize(
+        ("trajectory", "fail_when", "result", "last"),
+        [
+            (
+                meeting(KEEP, GOES, gap_m=5.5),
+                "paper",
+                "squeeze, conflict",
+                [f"{REACHES} 5.5 m behind the POV: closer than 6 m"],
+            ),
+            (
+                meeting(KEEP, GOES, gap_m=-5.2),
+                "paper",
+                "squeeze, contact at 3.9 m/s",
+                [
+                    f"{REACHES} 5.2 m ahead of the POV: closer than 6 m",
+                    "8.1 s   contact with the POV at 3.9 m/s",
+                ],
+            ),
+            (
+                meeting(parts((8.1, 0.0), (1.0, -4.0), (3.0, 0.0)), GOES, gap_m=-9.0),
+                "unsafe",
+                "cut in, harsh",
+                [
+                    f"{REACHES} 9.0 m ahead of the POV: braking of 8.0 m/s2 must follow",
+                    "8.1 s   the POV brakes: 30.0 to 26.0 m/s",
+                    "8.1 s   the POV brakes hardest after the merge: -4.0 m/s2",
+                ],
+            ),
+            (
+                meeting(KEEP, GOES, gap_m=30.0),
+                "t_end_s > 4",
+                "rule broken, safe",
+                ["11.0 s   fails: margin -1"],
+            ),
+            (
+                replace(meeting(KEEP, GOES), end=End.TIMEOUT, after=None),
+                'end == "TIMEOUT"',
+                "did not arrive, timeout",
+                ["8.0 s   the VUT did not reach the merge point in 8 s"],
+            ),
+        ],
+        ids=["near", "contact after M", "braking", "a rule of the user", "a timeout"],
+    )
+    def test_ends_with_what_broke_its_rule(self, trajectory, fail_when, result, last):
+        found = told(trajectory, fail_when)
+        assert (found.result, events(found)[-len(last) :]) == (result, last)
 
     def test_without_the_motion_is_how_they_arrived(self):
         outcome = Criterion().outcome(meeting(KEEP, GOES, gap_m=5.5))

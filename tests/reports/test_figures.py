@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import importlib
+import sys
 from types import SimpleNamespace
 from typing import Any
 
@@ -64,9 +64,6 @@ def test_a_file_is_the_same_for_the_same_numbers(tmp_path, kind):
 
 
 def test_a_figure_without_matplotlib_is_refused_in_a_sentence(tmp_path, monkeypatch):
-    def refuse(name: str):
-        raise ModuleNotFoundError(name=name)
-
-    monkeypatch.setattr(importlib, "import_module", refuse)
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
     with pytest.raises(UserError, match=r"pip install 'merge-sumo\[plot\]'"):
         figures.check_figure(tmp_path / "f.png")

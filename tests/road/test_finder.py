@@ -44,25 +44,26 @@ def test_a_point_of_a_path_is_where_sumo_draws_its_lane(built_road, name):
     assert compared >= 20
 
 
+BEND = Piece("a_0", -140.0, 140.0, 30.0, ((0, 0, 0), (30, 0, 0), (30, 40, 0)))
+"""A lane of which 70 m are drawn for 140 m that are driven."""
+
+
 def test_a_lane_point_by_hand():
-    bend = ((0.0, 0.0, 0.0), (30.0, 0.0, 0.0), (30.0, 40.0, 0.0))
-    piece = Piece("a_0", -140.0, 140.0, 30.0, bend)  # 70 m drawn for 140 m driven
-    assert piece.point(0.0) == (0.0, 0.0, 90.0)
-    assert piece.point(20.0) == (10.0, 0.0, 90.0)
-    assert piece.point(100.0) == pytest.approx((30.0, 20.0, 0.0))
-    assert piece.point(140.0) == pytest.approx((30.0, 40.0, 0.0))
+    assert BEND.point(0.0) == (0.0, 0.0, 90.0)
+    assert BEND.point(20.0) == (10.0, 0.0, 90.0)
+    assert BEND.point(100.0) == pytest.approx((30.0, 20.0, 0.0))
+    assert BEND.point(140.0) == pytest.approx((30.0, 40.0, 0.0))
 
 
 def test_a_body_has_both_bumpers_on_its_lane_by_hand():
     # 3 m past the corner of a right angle, with a body of 7 m: its rear is 4 m before the corner.
-    path = LanePath((Piece("a_0", -70.0, 70.0, 30.0, ((0, 0, 0), (30, 0, 0), (30, 40, 0))),))
+    path = LanePath((replace(BEND, start_m=-70.0, length_m=70.0),))
     at = replace(road_for(US23), ramp=path).front_bumper(-37.0, 7.0, on_ramp=True)
     assert at[2:] == pytest.approx((30.0, 3.0, math.degrees(math.atan2(4.0, 3.0))))
 
 
 def test_the_nearest_place_of_a_path_by_hand():
-    bend = ((0.0, 0.0, 0.0), (30.0, 0.0, 0.0), (30.0, 40.0, 0.0))
-    path = LanePath((Piece("a_0", -140.0, 140.0, 30.0, bend),))
+    path = LanePath((BEND,))
     assert path.nearest(10.0, -2.0) == pytest.approx((2.0, -120.0))
     assert path.nearest(33.0, 20.0) == pytest.approx((3.0, -40.0))
     assert path.nearest(-3.0, 4.0) == pytest.approx((5.0, -140.0))

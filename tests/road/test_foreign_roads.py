@@ -7,7 +7,6 @@ from __future__ import annotations
 import gzip
 import math
 import re
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -180,11 +179,6 @@ def test_a_road_has_its_right_of_way_and_its_limits_after_m(tmp_path, name, orde
 
 
 class TestRoadOf:
-    def test_finds_the_same_road_in_a_packed_net(self, tmp_path):
-        (tmp_path / "us23.net.xml.gz").write_bytes(gzip.compress(default_net_path().read_bytes()))
-        road = road_of(tmp_path / "us23.net.xml.gz")
-        assert replace(road, path=default_net_path()) == road_of()
-
     @pytest.mark.parametrize(
         ("content", "said"),
         [

@@ -11,17 +11,13 @@ import gymnasium
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
+from PIL import ImageColor
 
 from merge_sumo import training
 from merge_sumo.errors import UserError
 from merge_sumo.scenario.scenario import COLOURS
 from merge_sumo.training.env import MergeEnv
 from merge_sumo.training.registration import ENV_ID
-
-
-def pixels(colour):
-    """Return red, green and blue of a colour as CSS has it."""
-    return [int(colour[place : place + 2], 16) for place in (1, 3, 5)]
 
 
 @pytest.fixture
@@ -67,8 +63,8 @@ def test_cars_are_drawn_to_scale_in_the_colours_of_the_player():
         (x_pov_m, _, x_vut_m, _), _, has_ended, _, _ = game.step(5)
     frame = game.render()
     assert (frame.shape, frame.dtype) == ((240, 960, 3), np.uint8)
-    pov = np.argwhere((frame == pixels(COLOURS["pov"])).all(axis=2))
-    vut = np.argwhere((frame == pixels(COLOURS["vut"])).all(axis=2))
+    pov = np.argwhere((frame == ImageColor.getrgb(COLOURS["pov"])).all(axis=2))
+    vut = np.argwhere((frame == ImageColor.getrgb(COLOURS["vut"])).all(axis=2))
     # At M, where the paths have met, the view is as wide as both cars and 50 m, or 90 m.
     px_per_m = 960.0 / max(abs(x_pov_m - x_vut_m) + 50.0, 90.0)
     apart_m = (pov[:, 1].max() - vut[:, 1].max()) / px_per_m
