@@ -76,8 +76,12 @@ class Timeline:
 
     @property
     def in_a_line(self) -> str:
-        """Result and last event, where one line is shown."""
-        return f"{self.result}: {self.events[-1].text}"
+        """Result and last event, where one line is shown; what both have is said once."""
+        last = self.events[-1].text
+        _, contact, impact = self.result.partition("contact ")
+        if contact and last.endswith(impact):
+            return f"{self.kind}: {last}" if self.kind else last
+        return f"{self.result}: {last}"
 
     def lines(self, case: Case, name: str = "case") -> list[str]:
         """Return result, coordinates and events of a case as lines of a terminal.

@@ -103,6 +103,7 @@ class TestTheTimelineOfAFailure:
             "7.0 s   the VUT brakes: 25.0 to 21.0 m/s, 0.8 s too late",
             f"8.0 s   {MEETS} 4.0 m/s",
         ]
+        assert found.in_a_line == f"late brake: {MEETS} 4.0 m/s"
 
     def test_without_a_way_out_says_so(self):
         found = told(meeting(BRAKES, LATE), last_avoidable_s=None)
@@ -156,6 +157,10 @@ class TestTheTimelineOfAFailure:
     def test_ends_with_what_broke_its_rule(self, trajectory, fail_when, result, last):
         found = told(trajectory, fail_when)
         assert (found.result, events(found)[-len(last) :]) == (result, last)
+
+    def test_says_a_contact_once_in_a_line(self):
+        found = told(meeting(KEEP, GOES, gap_m=-5.2))
+        assert found.in_a_line == "squeeze: contact with the POV at 3.9 m/s"
 
     def test_without_the_motion_is_how_they_arrived(self):
         outcome = Criterion().outcome(meeting(KEEP, GOES, gap_m=5.5))
