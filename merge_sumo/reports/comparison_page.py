@@ -18,7 +18,7 @@ from merge_sumo.campaigns.recorded import AGAINST
 from merge_sumo.files import GENERATOR, replace_own
 from merge_sumo.metrics.timeline import timeline
 from merge_sumo.reports.pages import page
-from merge_sumo.reports.report_data import motion_row, packed, player_data
+from merge_sumo.reports.report_data import columns, motion_row, packed, player_data
 from merge_sumo.reports.text import change_in_words
 from merge_sumo.road.loader import centre_lines, road_or_shipped
 from merge_sumo.scenario.case import coordinates
@@ -95,27 +95,17 @@ def _data(
     """Return what the scripts draw: two entries of `cases` for each case shown."""
     scenario = shown[0][1].later.case.scenario
     road = road_or_shipped(scenario)
-    road_lines, motions = centre_lines(road), {}
-    cases: dict[str, list[Any]] = {"index": []}
+    road_lines = centre_lines(road)
+    motions, rows = [], []
     for version_change, one in shown:
         later = version_change.number
         for number, outcome in ((later - 1, one.earlier), (later, one.later)):
-            version, place = compared.versions[number - 1], len(cases["index"])
+            version, replay = compared.versions[number - 1], ""
             motion = version.motion(outcome.index)
             if motion is not None:
-                motions[place] = motion
-            told = timeline(outcome, motion, road_lines)
-            replay = ""
+                motions.append(motion)
             if version.folder is not None:
                 replay = command("replay", version.folder, outcome.index, gui=True)
-            row = {
-                "version": f"{number}  {version.vut}",
-                "result": told.result,
-                "events": [(event.time_s, event.text) for event in told.events],
-                "replay": replay,
-            }
-            for name, value in (motion_row(outcome, motion) | row).items():
-                cases.setdefault(name, []).append(value)
-    speeds, offsets = packed(motions)
-    cases["offset"] = [offsets.get(place, 0) for place in range(2 * len(shown))]
-    return {"cases": cases, "speeds": speeds, **player_data(scenario, road)}
+            row = motion_row(outcome, motion, timeline(outcome, motion, road_lines))
+            rows.append(row | {"version": f"{number}  {version.vut}", "replay": replay})
+    return {"cases": columns(rows), "speeds": packed(motions), **player_data(scenario, road)}

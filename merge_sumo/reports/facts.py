@@ -26,9 +26,8 @@ from merge_sumo.metrics.fmc import radius_for
 from merge_sumo.metrics.merge import Severity
 from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.metrics.summary import LevelSummary, Summary, by_case
-from merge_sumo.metrics.timeline import timeline
 from merge_sumo.printable import printable
-from merge_sumo.road.loader import centre_lines, road_or_shipped
+from merge_sumo.reports.text import timelines
 
 PERCENT = "%"
 
@@ -120,19 +119,6 @@ def facts_of(run: RecordedCampaign, summary: Summary) -> list[Fact]:
     facts += _avoided(run, summary.undecided_cases)
     facts += _studies(run)
     return facts
-
-
-def by_level(facts: Iterable[Fact]) -> dict[int, dict[str, Fact]]:
-    """Return the facts of each POV level by name.
-
-    Args:
-        facts: facts of a campaign; those of the whole campaign are left out.
-    """
-    rows: dict[int, dict[str, Fact]] = {}
-    for fact in facts:
-        if fact.level is not None:
-            rows.setdefault(fact.level, {})[fact.name] = fact
-    return rows
 
 
 def _settings(run: RecordedCampaign) -> Facts:
@@ -236,8 +222,7 @@ def _motion(run: RecordedCampaign, undecided: frozenset[int], failing: str) -> F
         return
     worst = failed[0]
     yield Fact(WORST, worst.index, "lowest margin")
-    motion = run.trajectories([worst.index]).get(worst.index)
-    kind = timeline(worst, motion, centre_lines(road_or_shipped(run.scenario))).result
+    kind = timelines(run, [worst])[worst.index].result
     yield Fact(KIND, kind, "severity, impact_speed_mps; by its motion")
     decided = [outcome for outcome in failed if outcome.index not in undecided]
     if avoidable := _values(decided, "avoidable"):

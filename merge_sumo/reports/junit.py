@@ -12,7 +12,7 @@ from merge_sumo.campaigns.recorded import NAME_CHARACTERS, RecordedCampaign
 from merge_sumo.files import check_new, write_new
 from merge_sumo.metrics.summary import by_case
 from merge_sumo.printable import printable
-from merge_sumo.reports.facts import Fact, by_level
+from merge_sumo.reports.facts import Fact
 from merge_sumo.reports.pages import environment
 from merge_sumo.reports.text import change_in_words, timelines, version_change_headline
 from merge_sumo.scenario.case import described
@@ -85,7 +85,7 @@ def write_junit(path: Path, result: CampaignRun) -> None:
         earlier = printable(str(run.settings.against)[:NAME_CHARACTERS])
         (version_change,) = result.against.version_changes
         suites[f"against {earlier}"] = _tests(version_change)
-    for level in by_level(result.facts):
+    for level in summary.levels:
         suites[f"POV level {level_name(level)}"] = []
     for test in _cases(run, summary.undecided_cases):
         suites[f"POV {test.group}"].append(test)

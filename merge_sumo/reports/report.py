@@ -33,7 +33,6 @@ from merge_sumo.metrics.plausibility import doubts
 from merge_sumo.metrics.timeline import KINDS
 from merge_sumo.reports import facts
 from merge_sumo.reports.comparison_page import AGAINST_PAGE, write_against
-from merge_sumo.reports.facts import by_level
 from merge_sumo.reports.pages import page
 from merge_sumo.reports.report_data import page_data, pairs_of
 from merge_sumo.reports.report_model import INDEX, ReportModel
@@ -99,7 +98,6 @@ def report_page(model: ReportModel, *, running: bool = False) -> str:
         notes=notes,
         go_on=campaign_command("resume", run.folder, run.record),
         printed=end_of(run.folder / LOG),
-        levels=by_level(model.facts),
         of={fact.name: fact for fact in model.facts if fact.level is None},
         measure=campaign_command("probability", run.folder, run.record),
         kinds=Counter(one.kind for one in model.timelines.values() if one.kind).most_common(),

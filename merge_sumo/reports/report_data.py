@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import base64
+from collections.abc import Iterable
+from dataclasses import astuple
 from itertools import combinations
 from typing import Any
 
@@ -15,6 +17,7 @@ from merge_sumo.metrics.measures import recorded_measures
 from merge_sumo.metrics.merge import Conflict, Severity
 from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.metrics.summary import CONFIDENCE, clopper_pearson, shortened
+from merge_sumo.metrics.timeline import Timeline
 from merge_sumo.printable import printable
 from merge_sumo.records import to_plain
 from merge_sumo.reports.pages import ERROR_CHARACTERS
@@ -40,49 +43,36 @@ Axes = tuple[int, int]
 
 
 def page_data(model: ReportModel) -> dict[str, Any]:
-    """Return the data of a report as JSON has it.
+    """Return the data of a report, as values that msgspec writes as JSON.
 
     Args:
         model: the content of the report.
 
     Returns:
-        `cases` maps each name of `_row` to a list with a value for each shown case. `allCases` in
-        report.js makes the table All cases of it, with a column for each entry of `measures`.
-        `speeds` is as `packed` returns it.
+        `cases` has the columns of `_row`. `allCases` in report.js makes the table All cases of it,
+        with a column for each entry of `measures` that some case has. `speeds` is as `packed`
+        returns it.
     """
     scenario = model.run.scenario
-    speeds, offsets = packed(model.motion)
-    cases: dict[str, list[Any]] = {"index": []}
-    for outcome in model.shown:
-        row = _row(model, outcome) | {
-            "offset": offsets.get(outcome.index, 0),
-        }
-        for name, value in row.items():
-            cases.setdefault(name, []).append(value)
     measures = []
     for name, measure in recorded_measures(scenario).items():
-        if measure.column and any(value is not None for value in cases.get(name, ())):
+        if measure.column:
             unit = measure.unit.replace("s2", "s²")
             title = f"{scenario.wording(measure.column)} {unit}".rstrip()
             measures.append({"name": name, "title": title, "digits": measure.digits})
-    axes = []
-    for c in model.coordinates:
-        # Cases are shown in full this near to the reader's place in a third coordinate.
-        near = (c.high - c.low) / 16.0
-        axis = {"name": c.name, "unit": c.unit, "digits": c.digits, "near": near}
-        axes.append(axis | {"field": c.field, "low": c.low, "high": c.high})
     return {
         "varies": model.varies,
         "place": "M" if scenario.lane_m is None else scenario.place,
         "level_names": {level: level_name(level) for level in ALL_LEVELS},
-        "coordinates": axes,
+        "coordinates": model.coordinates,
         "severities": list(Severity),
         "measures": measures,
-        "cases": cases,
-        "speeds": speeds,
+        "cases": columns(_row(model, outcome) for outcome in model.shown),
+        "speeds": packed(model.motion.values()),
         "signals": {i: to_runs(t.signals) for i, t in model.motion.items() if t.signals},
         "why": _explanations(model),
-        "regions": [{"level": one.level, "number": one.number} for one in model.described],
+        "regions": model.described,
+        "count_grid": COUNT_GRID,
         "maps": {level: _map(model, level) for level in model.levels},
         "search": _search(model),
         **player_data(scenario, model.road),
@@ -108,12 +98,26 @@ def player_data(scenario: Scenario, road: Road) -> dict[str, Any]:
     }
 
 
-def motion_row(outcome: Outcome, motion: Trajectory | None) -> dict[str, Any]:
-    """Return what player.js reads of a case, apart from its first row in the speeds.
+def columns(rows: Iterable[dict[str, Any]]) -> dict[str, list[Any]]:
+    """Return the values of all rows by name.
+
+    Args:
+        rows: rows with the same names.
+    """
+    found: dict[str, list[Any]] = {"index": []}
+    for row in rows:
+        for name, value in row.items():
+            found.setdefault(name, []).append(value)
+    return found
+
+
+def motion_row(outcome: Outcome, motion: Trajectory | None, told: Timeline) -> dict[str, Any]:
+    """Return motion and events of a case, apart from its speeds.
 
     Args:
         outcome: the outcome of the case.
         motion: its motion; None where it is lost, which gives 0 rows.
+        told: its timeline.
     """
     return {
         "index": outcome.index,
@@ -122,6 +126,8 @@ def motion_row(outcome: Outcome, motion: Trajectory | None) -> dict[str, Any]:
         "rows": 0 if motion is None else len(motion.whole),
         "end": outcome.measures.end,
         "t_end_s": outcome.measures.t_end_s,
+        "events": [astuple(event) for event in told.events],
+        "result": told.result,
     }
 
 
@@ -130,7 +136,7 @@ def _row(model: ReportModel, outcome: Outcome) -> dict[str, Any]:
     index, measures = outcome.index, outcome.measures
     motion, told = model.motion.get(index), model.timelines[index]
     row: dict[str, Any] = {
-        **motion_row(outcome, motion),
+        **motion_row(outcome, motion, told),
         "level": outcome.case.level,
         "conflict": None if motion is None else [*Conflict.of(motion, centre_lines(model.road))],
         "error": measures.error and shortened(measures.error, ERROR_CHARACTERS),
@@ -138,9 +144,8 @@ def _row(model: ReportModel, outcome: Outcome) -> dict[str, Any]:
         "failed": outcome.failed,
         "margin": _rounded(outcome.margin, 3),
         "region": model.regions.get(index),
-        "events": [(event.time_s, event.text, event.car) for event in told.events],
-        "result": told.result,
         "kind": told.kind,
+        "undecided": index in model.summary.undecided_cases,
     }
     for coordinate in model.coordinates:
         row[coordinate.field] = _rounded(coordinate.of(outcome.case), coordinate.digits + 2)
@@ -158,8 +163,6 @@ def _row(model: ReportModel, outcome: Outcome) -> dict[str, Any]:
             each = [(run.index, run.failed) for run in runs.outcomes]
             row["runs"] = {"failed": runs.failures, "number": runs.runs, "each": each}
             row["runs"] |= {"low": low, "high": high}
-    if model.summary.undecided:
-        row["undecided"] = index in model.summary.undecided_cases
     return row
 
 
@@ -196,23 +199,20 @@ def _search(model: ReportModel) -> dict[str, Any]:
     return {"cases": steps, "levels": levels}
 
 
-def packed(motions: dict[int, Trajectory]) -> tuple[str, dict[int, int]]:
-    """Return the speeds of all cars at every step in base64, and the first row of each motion.
+def packed(motions: Iterable[Trajectory]) -> str:
+    """Return the speeds of all cars at every step in base64.
 
     Args:
-        motions: trajectories by index of the case.
+        motions: trajectories, in the order of the cases.
 
     Returns:
-        Speeds as 16-bit little-endian numbers, row by row, in units of `SPEED_UNIT_MPS`; the first
-        row of each case by its index.
+        Speeds as 16-bit little-endian numbers, row by row, in units of `SPEED_UNIT_MPS`.
     """
-    first, rows, content = {}, 0, b""
-    for index, motion in motions.items():
+    content = b""
+    for motion in motions:
         speeds = np.rint(np.clip(motion.whole[:, :, 1] / SPEED_UNIT_MPS, 0, 65535))
         content += speeds.astype("<u2").tobytes()
-        first[index] = rows
-        rows += len(speeds)
-    return base64.b64encode(content).decode(), first
+    return base64.b64encode(content).decode()
 
 
 def pairs_of(dims: int) -> list[Axes]:
@@ -233,24 +233,20 @@ def _map(model: ReportModel, level: int) -> dict[str, Any]:
     dims, surface = len(model.axes[level]), model.surfaces[level]
     probability = _probability(surface, GRID[dims]) if surface and dims in GRID else None
     shown = {outcome.index for outcome in model.shown}
-    others = [o for o in model.cases if o.case.level == level and o.index not in shown]
+    others = [o for o in model.run.cases if o.case.level == level and o.index not in shown]
     points = to_unit((outcome.case for outcome in others), level, model.run.scenario)
     failed = np.array([outcome.failed for outcome in others], dtype=bool)
-    grids = []
-    for axes in pairs_of(dims):
-        counts: dict[str, Any] | None = None
-        if others:
-            nx, ny = COUNT_GRID
-            places = points[:, axes]
-            counts = {"nx": nx, "ny": ny}
-            counts["safe"], counts["failing"] = _counts(places[~failed]), _counts(places[failed])
-        grids.append({"probability": probability, "counts": counts})
+    counts = []
+    for axes in pairs_of(dims) if others else ():
+        places = points[:, axes]
+        counts.append([_counts(places[~failed]), _counts(places[failed])])
     return {
         "pairs": pairs_of(dims),
         "through": 2 if dims == 3 else None,
         # In more coordinates a ball is as wide as the map.
         "radius": radius_for(dims) if dims <= 3 else None,
-        "grids": grids,
+        "probability": probability,
+        "counts": counts,
     }
 
 

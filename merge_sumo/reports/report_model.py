@@ -5,7 +5,7 @@ from __future__ import annotations
 from merge_sumo.analysis.comparison import compare_against
 from merge_sumo.analysis.counterfactuals import AVOIDANCE
 from merge_sumo.analysis.explanation import EXPLANATIONS
-from merge_sumo.analysis.share import SHARES
+from merge_sumo.analysis.share import SHARES, LevelShare
 from merge_sumo.analysis.stress import STRESS
 from merge_sumo.analysis.surface import Surface, learn_surface
 from merge_sumo.campaigns.printed_commands import campaign_command
@@ -32,9 +32,7 @@ class ReportModel:
 
     Attributes:
         run: the campaign.
-        learns: whether there are surrogates.
         road: road of the campaign.
-        cases: the deciding run of each case.
         repeated: by its index, all runs of a case that ran more than once.
         varies: whether runs of a case differ.
         summary: summary of the campaign, with its undecided cases.
@@ -43,7 +41,7 @@ class ReportModel:
         surfaces: surrogate of each level; None without one.
         coordinates: coordinates of all levels.
         axes: coordinates of each level, in the pool's order.
-        shares: share of all starts that fail, and its interval, by level, each from 0 to 1.
+        shares: the uniform cases of each level of which some have a verdict.
         stress: result of the stress test; None without one.
         avoidance: drivers that avoid a failure, by its index.
         explanations: explanations of failures.
@@ -72,9 +70,8 @@ class ReportModel:
             run: the campaign.
             learns: whether to learn a surrogate of each level, which takes seconds.
         """
-        self.run, self.learns = run, learns
+        self.run = run
         self.road = road_or_shipped(run.scenario)
-        self.cases = run.cases
         runs = [case for case in by_case(run.outcomes) if case.runs > 1]
         self.repeated = {case.deciding(run.tolerated).index: case for case in runs}
         self.varies = any(case.varies for case in runs)
@@ -87,11 +84,11 @@ class ReportModel:
                 self.surfaces[level] = learn_surface(run.outcomes, level, run.tolerated)
         self.coordinates = coordinates(run.scenario, self.levels or LEVELS)
         self.axes = {level: coordinates(run.scenario, (level,)) for level in self.levels}
-        self.shares: dict[int, tuple[float, float, float]] = {}
+        self.shares: dict[int, LevelShare] = {}
         known = SHARES.read(run.folder)
         for one in known.levels if known else ():
             if one.without_verdict < one.cases:
-                self.shares[one.level] = (one.failures / one.cases, *one.interval)
+                self.shares[one.level] = one
         self.stress = STRESS.read(run.folder)
         self.avoidance = {one.index: one for one in AVOIDANCE.read_lines(run)}
         self.explanations = EXPLANATIONS.read_lines(run)
@@ -101,19 +98,19 @@ class ReportModel:
         self.timelines = timelines(run, self.shown)
         self.described: list[FailureRegion] = []
         for level in self.levels:
-            self.described += failure_regions(self.cases, level, self.regions)
+            self.described += failure_regions(run.cases, level, self.regions)
         self.explain = campaign_command("explain", run.folder, run.record, INDEX)
 
     def _choose_cases(self) -> None:
         """Choose the cases that are listed, and those that the page holds one by one."""
         passing: list[Outcome] = []
         untested: list[Outcome] = []
-        for outcome in self.cases:
+        for outcome in self.run.cases:
             if not outcome.is_tested or outcome.margin is None:
                 untested.append(outcome)
             elif not outcome.failed:
                 passing.append(outcome)
-        self.worst = failures(self.cases)
+        self.worst = failures(self.run.cases)
         self.regions = regions_of(self.worst)
         self.spread = spread_failures(self.worst)
         if self.stress is not None:

@@ -60,16 +60,6 @@ def aligned(rows: Sequence[Sequence[str]], left: int = 0) -> list[str]:
     return lines
 
 
-def cut(number: int, most: int) -> str:
-    """Return how many items of a list are shown, to stand after its title.
-
-    Args:
-        number: number of all items.
-        most: maximum number of items that are shown.
-    """
-    return f", the first {most} of {number}" if number > most else f", {number}"
-
-
 # Comparisons
 
 
@@ -149,7 +139,8 @@ def comparison_lines(compared: Comparison) -> list[str]:
         for change in Change:
             changed = [case for case in version_change.cases if case.change is change]
             if changed and change.group in ("worse", "not counted"):
-                text.append(f"{change}{cut(len(changed), LISTED)}:")
+                first = f"the first {LISTED} of " if len(changed) > LISTED else ""
+                text.append(f"{change}, {first}{len(changed)}:")
                 for case in changed[:LISTED]:
                     text.append(f"  case {case.later.index}: {change_in_words(case)}")
     return [*text, compared.source, *compared.notes]

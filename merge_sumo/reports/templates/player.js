@@ -26,9 +26,11 @@ const speedBytes = bytes(data.speeds);
 const speeds = new DataView(speedBytes.buffer);
 const speedAt = (k) => speeds.getUint16(2 * k, true) * data.speed_unit_mps;
 
+let packed = 0;
+const firstRows = (cases.rows ?? []).map((rows) => (packed += rows) - rows); // of each case, in the speeds
 function motion(i) {
   // Speeds are kept; positions follow by x' = x + v dt, as the vehicles moved.
-  const rows = cases.rows[i], first = cases.offset[i];
+  const rows = cases.rows[i], first = firstRows[i];
   if (!rows) return null;
   const v = vehicles.map((_, who) => Array.from({ length: rows }, (_, t) => speedAt((first + t) * vehicles.length + who)));
   const x = v.map((speed, who) => {

@@ -5,7 +5,7 @@ const place = new Map(cases.index.map((index, i) => [index, i]));
 
 /* ---------- cases ---------- */
 const failed = (i) => cases.failed[i];
-const undecided = (i) => cases.undecided?.[i] ?? false; // it fails, and ran too seldom to tell
+const undecided = (i) => cases.undecided[i]; // it fails, and ran too seldom to tell
 let matching = null; // the cases that the filters let through; null without a filter
 const wanted = (i) => matching === null || matching.has(i);
 function avoidedBy(i, who) { // a driver, "pov" or "none"
@@ -91,7 +91,7 @@ function FailureMap(figure) {
   const pairs = figure.querySelector("select");
   let pair = 0, at = 0, all = true, axes = [], marks = [];
   const apart = (i) => (all ? 0 : Math.abs(cases[third.field][i] - at));
-  const near = (i) => all || apart(i) <= third.near;
+  const near = (i) => all || apart(i) <= (third.high - third.low) / 16;
 
   const ball = (parent, { i, x, y }, radius) => { // the slice of a ball around a case
     const off = all ? 0 : apart(i) / (third.high - third.low);
@@ -107,7 +107,7 @@ function FailureMap(figure) {
   };
   this.level = level;
   this.draw = () => {
-    const { probability } = of.grids[pair], share = all ? null : unit(third, at);
+    const { probability } = of, share = all ? null : unit(third, at);
     svg.replaceChildren();
     const clip = draw(draw(svg, "defs"), "clipPath", { id: "clip" });
     draw(clip, "rect", { x: left, y: top, width, height });
@@ -166,13 +166,13 @@ function FailureMap(figure) {
     }
   };
   const counts = () => { // of a long campaign: the cases that are not listed one by one
-    const grid = of.grids[pair].counts;
-    if (!grid) return;
-    const most = Math.max(...grid.safe, ...grid.failing, 1);
-    for (let n = 0; n < grid.nx * grid.ny; n++) {
-      const x = X((n % grid.nx) / grid.nx), y = Y((Math.floor(n / grid.nx) + 1) / grid.ny);
-      for (const [name, count] of [["count", grid.safe[n]], ["count failing", grid.failing[n]]]) if (count) {
-        draw(svg, "rect", { class: name, x, y, width: width / grid.nx, height: height / grid.ny, "clip-path": "url(#clip)", "fill-opacity": (0.08 + 0.5 * count / most).toFixed(3) });
+    if (!of.counts.length) return;
+    const [safe, failing] = of.counts[pair], [nx, ny] = data.count_grid;
+    const most = Math.max(...safe, ...failing, 1);
+    for (let n = 0; n < nx * ny; n++) {
+      const x = X((n % nx) / nx), y = Y((Math.floor(n / nx) + 1) / ny);
+      for (const [name, count] of [["count", safe[n]], ["count failing", failing[n]]]) if (count) {
+        draw(svg, "rect", { class: name, x, y, width: width / nx, height: height / ny, "clip-path": "url(#clip)", "fill-opacity": (0.08 + 0.5 * count / most).toFixed(3) });
       }
     }
   };
@@ -445,7 +445,7 @@ function allCases() { // gives what shows the cases that the filters let through
       { name: "share of runs that fail", exact: true, value: (i) => { const runs = runsOf(i); return runs ? runs.failed / runs.number : tested(i) ? Number(failed(i)) : null; }, text: (value) => fixed(value, 2) },
     ] : []),
     number("margin", "margin", 2),
-    ...data.measures.map((measure) => number(measure.name, measure.title, measure.digits)),
+    ...data.measures.filter(({ name }) => cases[name]?.some((value) => value !== null)).map((measure) => number(measure.name, measure.title, measure.digits)),
   ];
   const all = cases.index.map((_, i) => i), PART = 100;
   let by = columns.find(({ name }) => name === "margin"), way = 1, found = all, rows = 0;
