@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +22,7 @@ from support.scenes import scene_of
 from merge_sumo.controllers.kinds import load
 from merge_sumo.controllers.process import append
 from merge_sumo.controllers.spec import ControllerOptions
-from merge_sumo.drivers.base import EpisodesLostError, Scene
+from merge_sumo.drivers.base import Driver, EpisodesLostError, Scene
 from merge_sumo.errors import UserError
 
 OPTIONS = ControllerOptions(deadline_s=0.3)
@@ -71,15 +72,17 @@ def scene(corridors: int) -> Scene:
     return scene_of(*[np.full(corridors, 20.0)] * 4)
 
 
+def opened(spec: str, corridors: int) -> closing[Driver]:
+    """Return a context with the driver of a spec, which is closed in the end."""
+    return closing(load(spec, OPTIONS).open(corridors))
+
+
 def test_after_a_death_it_starts_again_and_knows_which_files_there_were(write_vut):
-    vut = load(write_vut("import os\ndef Vut(seen):\n    os._exit(3)\n"), OPTIONS).open(2)
-    try:
+    with opened(write_vut("import os\ndef Vut(seen):\n    os._exit(3)\n"), 2) as vut:
         for _ in range(2):
             with pytest.raises(EpisodesLostError, match="exit code 3"):
                 vut.act(scene(2))
             assert {file.name for file in vut.files()} == {"my_vut.py"}
-    finally:
-        vut.close()
 
 
 def test_half_an_answer_and_no_more_ends_at_the_deadline(write_vut):
@@ -98,21 +101,16 @@ def Vut(seen):
         except BaseException:
             pass
 """
-    vut = load(write_vut(source), OPTIONS).open(2)
-    try:
-        with pytest.raises(EpisodesLostError, match=r"the deadline of 0\.3 s"):
-            vut.act(scene(2))
-    finally:
-        vut.close()
+    late = r"the deadline of 0\.3 s"
+    with opened(write_vut(source), 2) as vut, pytest.raises(EpisodesLostError, match=late):
+        vut.act(scene(2))
 
 
 def test_controllers_that_take_long_together_are_not_late(write_vut):
     source = "import time\ndef Vut(seen):\n    time.sleep(0.2)\n    return 1.0\n"
-    vut = load(write_vut(source), OPTIONS).open(10)  # 2 s, and the process has 1.7 s
-    try:
+    # 2 s, and the process has 1.7 s
+    with opened(write_vut(source), 10) as vut:
         assert vut.act(scene(10)).tolist() == [1.0] * 10
-    finally:
-        vut.close()
 
 
 def test_its_code_may_not_change_and_data_that_it_reads_may(write_vut, tmp_path):
@@ -138,13 +136,10 @@ def Vut(seen):
 
 def test_what_it_imports_while_it_drives_is_of_its_files(write_vut, tmp_path):
     (tmp_path / "late.py").touch()
-    vut = load(write_vut("def Vut(seen):\n    import late\n    return 1.0\n"), OPTIONS).open(1)
-    try:
+    with opened(write_vut("def Vut(seen):\n    import late\n    return 1.0\n"), 1) as vut:
         assert {f.name for f in vut.files()} == {"my_vut.py"}
         vut.act(scene(1))
         assert {f.name for f in vut.files()} == {"my_vut.py", "late.py"}
-    finally:
-        vut.close()
 
 
 def test_what_it_prints_is_in_the_folder_of_the_campaign(write_vut, tmp_path, capfd):

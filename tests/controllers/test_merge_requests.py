@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import re
+from contextlib import closing
 
 import numpy as np
 import pytest
@@ -65,28 +66,22 @@ class Vut:
 
 @pytest.mark.parametrize("process", ["this", "own"])
 def test_a_controller_answers_an_acceleration_or_it_and_a_merge_request(write_vut, process):
-    driver = begun(write_vut(OF_EACH), 4, in_process=process == "this")
-    try:
+    with closing(begun(write_vut(OF_EACH), 4, in_process=process == "this")) as driver:
         answer = driver.act(on_lane([-150.0, -90.0, -71.0, -50.0], [False, False, False, True]))
         assert answer.tolist() == [1.0, 1.0, 1.0, 0.5]
         assert driver.merge_requests().tolist() == [NO_REQUEST, STAY, MERGE, NO_REQUEST]
         assert driver.merge_requests().dtype == np.int8
         driver.act(on_lane([-150.0] * 4, [False] * 4))
         assert driver.merge_requests() is None
-    finally:
-        driver.close()
 
 
 @pytest.mark.parametrize("process", ["this", "own"])
 def test_a_batched_controller_answers_merge_requests_in_a_second_row(write_vut, process):
     idle = on_lane([-90.0, -71.0, -50.0], [False, False, True])
     idle = idle._replace(active=np.array([True, True, False]))
-    driver = begun(write_vut(OF_ALL), 3, in_process=process == "this")
-    try:
+    with closing(begun(write_vut(OF_ALL), 3, in_process=process == "this")) as driver:
         assert driver.act(idle).tolist() == [1.0, 1.0, 0.5]
         assert driver.merge_requests().tolist() == [STAY, MERGE, NO_REQUEST]
-    finally:
-        driver.close()
 
 
 REQUESTS = {"True": MERGE, "0.0": STAY, "np.array(1)": MERGE}
@@ -156,9 +151,6 @@ _Host._act = lambda host, request: HostReply(accelerations_mps2=[1.0, 1.0], merg
 def Vut(seen):
     return 1.0, True
 """
-    driver = begun(write_vut(source), 2, deadline_s=1.0)
-    try:
-        with pytest.raises(EpisodesLostError, match="broke the channel to its process"):
-            driver.act(on_lane([-71.0, -71.0], [False, False]))
-    finally:
-        driver.close()
+    driver, said = begun(write_vut(source), 2, deadline_s=1.0), "broke the channel to its process"
+    with closing(driver), pytest.raises(EpisodesLostError, match=said):
+        driver.act(on_lane([-71.0, -71.0], [False, False]))

@@ -9,7 +9,7 @@ import pytest
 from export_policy import export_onnx
 from support.merges import SMALLER
 from support.networks import constant_network as network
-from support.vut_contract import begin, cases_of, in_process, on_lane, run_cases
+from support.vut_contract import begin, cases_of, in_process, on_lane, run_cases, same
 
 from merge_sumo.drivers.base import MERGE
 from merge_sumo.errors import UserError
@@ -25,8 +25,7 @@ def test_an_exported_policy_as_vut_drives_like_the_built_in_one(tmp_path, scenar
     export_onnx("vut1", tmp_path / "vut1.onnx", scenario=scenario)
     cases = from_unit(np.random.default_rng(1).random((40, 3)), level=2, scenario=scenario)
     by_onnx = run_cases(in_process(f"onnx:{tmp_path / 'vut1.onnx'}"), cases)
-    for one, other in zip(by_onnx, run_cases(in_process("level1"), cases), strict=True):
-        assert np.array_equal(one.motion, other.motion)
+    assert same(by_onnx, run_cases(in_process("level1"), cases))
 
 
 def test_one_number_is_an_acceleration_and_seven_are_values_of_actions(tmp_path):

@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 from support.merges import HALF, SMALLER
-from support.plans import plan_for
+from support.vut_contract import factory, run_cases, same
 
 from merge_sumo.drivers.levelk import (
     FEATURES,
@@ -29,7 +29,6 @@ from merge_sumo.road.loader import road_for
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.scenario.case import from_unit
 from merge_sumo.scenario.scenario import US23
-from merge_sumo.simulation.evaluate import simulate
 from merge_sumo.simulation.kinematic_simulation import KinematicSimulation
 from merge_sumo.simulation.rollout import Rollout
 from merge_sumo.training.best_response import best_response
@@ -76,9 +75,7 @@ def test_a_shipped_library_is_complete_and_its_manifest_says_how_it_was_made(nam
 
 def test_learned_episodes_are_the_same_in_1_and_in_32_corridors():
     cases = uniform_cases(1, 50, seed=3) + uniform_cases(2, 50, seed=3)
-    one, many = (simulate(plan_for("level1", corridors=n), cases) for n in (1, 32))
-    for alone, among_others in zip(one, many, strict=True):
-        assert np.array_equal(alone.trajectory.motion, among_others.trajectory.motion)
+    assert same(*(run_cases(factory("level1"), cases, corridors) for corridors in (1, 32)))
 
 
 def states(n):

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from lxml import etree
 from metrics.test_chance import CASE, outcomes
-from support.calling import Result, invoke
+from support.calling import invoke
 from support.campaigning import campaign_settings, run_campaign
 from support.handmade import write_run
 
@@ -26,29 +26,11 @@ from merge_sumo.scenario.trajectory import End
 
 HOSTILE = "</failure><x>\x00\x1b[2J\ud800\uffff\u202e\n&\"'"
 CHANCE = f"{Path(__file__).parents[1]}/support/chance_vuts.py:Slope"
-VUTS = {
-    "raises": "raise RuntimeError('boom')",
-    "mixed": "assert seen.v_pov_mps < 33, 'fast'; return 1.0 if seen.v_pov_mps < 30 else -4.0",
-}
-
-
-@pytest.fixture(scope="module")
-def vuts(tmp_path_factory) -> dict[str, str]:
-    """Return by name what goes behind --vut: one raises, one does so at times, or stops."""
-    folder = tmp_path_factory.mktemp("vuts")
-    specs = {}
-    for name, body in VUTS.items():
-        (folder / f"{name}.py").write_text(f"def act(seen):\n    {body}\n")
-        specs[name] = f"{folder / name}.py:act"
-    return specs
-
-
-def campaign(vut: str, folder: Path, *options: object) -> Result:
-    small = (
-        *("--level", 0, "--cases", 20, "--seed", 1, "--sampler", "uniform"),
-        "-q",
-    )
-    return invoke("campaign", "--vut", vut, *small, "--out", folder, *options)
+MIXED = (
+    "def act(seen):\n"
+    "    assert seen.v_pov_mps < 33, 'fast'; return 1.0 if seen.v_pov_mps < 30 else -4.0\n"
+)
+"""Raises in some cases, and stops in others."""
 
 
 def test_errors_and_timeouts_are_grouped_by_message_errors_first_then_the_most_frequent(tmp_path):
@@ -148,8 +130,10 @@ def test_an_undecided_case_is_skipped_in_junit(tmp_path):
     assert all(one.get("message").startswith("undecided: ") for one in root.iter("skipped"))
 
 
-def test_a_campaign_that_tested_nothing_exits_with_1_and_says_why_first(vuts, tmp_path):
-    said = campaign(vuts["raises"], tmp_path / "run")
+def test_a_campaign_that_tested_nothing_exits_with_1_and_says_why_first(write_vut, tmp_path):
+    vut = write_vut("def act(seen):\n    raise RuntimeError('boom')\n", "act")
+    few = ("--level", 0, "--cases", 20, "--sampler", "uniform", "-q")
+    said = invoke("campaign", "--vut", vut, *few, "--out", tmp_path / "run")
     assert said.exit_code == 1
     assert said.stdout.splitlines()[0].endswith(" on us23: 20 cases, 20 errors, nothing tested")
     assert "\nNot judged:  20 VUT_ERROR, the first in case 0" in said.stdout
@@ -158,39 +142,35 @@ def test_a_campaign_that_tested_nothing_exits_with_1_and_says_why_first(vuts, tm
 
 
 @pytest.fixture(scope="module")
-def mixed(vuts, tmp_path_factory) -> Path:
-    folder = tmp_path_factory.mktemp("mixed") / "run"
-    settings = campaign_settings(vut=vuts["mixed"], sampler="uniform", cases=20, seed=1)
-    found = summarise(run_campaign(settings, folder).outcomes)
+def mixed(tmp_path_factory) -> tuple[object, ...]:
+    """Return options that go on with a finished campaign, whose folder names no code to run."""
+    folder = tmp_path_factory.mktemp("mixed")
+    (folder / "mixed.py").write_text(MIXED)
+    settings = campaign_settings(vut=f"{folder}/mixed.py:act", sampler="uniform", cases=20, seed=1)
+    found = summarise(run_campaign(settings, folder / "run").outcomes)
     assert min(found.errors, found.timeouts, found.tested) > 0
-    return folder
-
-
-def again(folder: Path, vuts: dict[str, str]) -> tuple[object, ...]:
-    """Return the options that resume the mixed campaign, whose folder names no code to run."""
-    return ("--resume", folder, "--vut", vuts["mixed"])
+    return "--resume", folder / "run", "--vut", settings.vut
 
 
 class TestACampaignWithGates:
     @pytest.mark.parametrize(("gates", "code"), [((), 0), (("fmc>0.99", "timeouts"), 1)])
-    def test_exits_with_1_when_one_is_met_also_when_it_is_resumed(self, vuts, mixed, gates, code):
-        before = (mixed / "campaign.json").read_bytes()
+    def test_exits_with_1_when_one_is_met_also_when_it_is_resumed(self, mixed, gates, code):
+        before = (mixed[1] / "campaign.json").read_bytes()
         options = [word for gate in gates for word in ("--gate", gate)]
-        said = invoke("campaign", *again(mixed, vuts), "-q", "--json", *options)
+        said = invoke("campaign", *mixed, "-q", "--json", *options)
         assert said.exit_code == code
         found = json.loads(said.stdout)
         assert found["passed"] is (code == 0)
         assert found["gates"] == {gate: gate == "timeouts" for gate in gates}
         assert said.stderr.count("gate ") == len(gates)
-        assert (mixed / "campaign.json").read_bytes() == before
+        assert (mixed[1] / "campaign.json").read_bytes() == before
 
-    def test_writes_junit_and_never_over_a_file(self, vuts, tmp_path, mixed):
+    def test_writes_junit_and_never_over_a_file(self, tmp_path, mixed):
         file = tmp_path / "junit.xml"
-        options = ("--junit", file, "--gate", "errors")
-        assert campaign(vuts["mixed"], tmp_path / "run", *options).exit_code == 1
+        assert invoke("campaign", *mixed, "--junit", file, "--gate", "errors").exit_code == 1
         root = read_junit(file)
         assert root.get("tests") == "22"
         before = file.read_bytes()
-        said = invoke("campaign", *again(mixed, vuts), "--junit", file)
+        said = invoke("campaign", *mixed, "--junit", file)
         assert "choose another name with `junit`" in str(said.exception)
         assert file.read_bytes() == before

@@ -67,12 +67,6 @@ class TestTheWindow:
         with pytest.raises(UserError, match=said):
             find_road(net, ["in", "acc", "out"], ["ramp", "acc", "out"], lane_m=(-150.0, 130.0))
 
-    def test_is_refused_in_a_net_without_its_junctions(self, tmp_path):
-        net = lane_drop(tmp_path)
-        net.write_text(net.read_text().replace("junction", "param"))
-        with pytest.raises(UserError, match="not a valid SUMO net"):
-            find_road(read_net(net), ["in", "acc", "out"], ["ramp", "acc", "out"], lane_m=LANE_M)
-
     def test_is_refused_on_a_road_without_such_a_lane(self, tmp_path):
         build, mainline, ramp = FOREIGN["priority"]
         net = read_net(build(tmp_path))

@@ -171,6 +171,7 @@ def edited(old: str, new: str):
         (edited('(<edge id="r1" .*)to="m"', r"\1"), "not a valid SUMO net"),
         (edited('(<junction id="m" .*) x="[^"]*"', r'\1 x="far"'), "<junction> in line .*'far'"),
         (lambda text: text.replace("<request ", "<phase "), "not a valid SUMO net"),
+        (lambda text: text.replace("junction", "param"), "not a valid SUMO net"),
     ],
 )
 def test_a_broken_net_is_refused_in_one_sentence(straight_net, tmp_path, edit, message):

@@ -14,7 +14,7 @@ from support.calling import assert_refused
 from support.misbehaviours import CATALOGUE, DEADLINE_S, GUILTY_MPS
 from support.plans import plan_for
 from support.processes import none_left
-from support.vut_contract import cases_of, factory
+from support.vut_contract import cases_of, factory, same
 
 from merge_sumo.controllers.spec import ControllerOptions
 from merge_sumo.drivers.policies import policies_of
@@ -40,12 +40,6 @@ def of_a_user(tmp_path, monkeypatch):
     monkeypatch.setenv("MERGE_SUMO_CACHE", str(tmp_path / "mine"))
     (tmp_path / "here").mkdir()
     monkeypatch.chdir(tmp_path / "here")
-
-
-@pytest.fixture
-def call(command_line):
-    """Return what runs the command line, in that folder."""
-    return command_line
 
 
 def pov(source: str, name: str = "my_pov.py") -> str:
@@ -80,13 +74,6 @@ def run(
         )
     ) as ground:
         return ground.run(cases)
-
-
-def same(one: list[Trajectory], other: list[Trajectory]) -> bool:
-    return all(
-        np.array_equal(a.motion, b.motion) and a.end is b.end
-        for a, b in zip(one, other, strict=True)
-    )
 
 
 class TestAPov:
@@ -173,9 +160,9 @@ class TestACampaign:
             (("--pov", "nowhere.py:Pov"), "the POV nowhere.py:Pov: cannot"),
         ],
     )
-    def test_is_refused_in_one_sentence(self, call, arguments, said):
+    def test_is_refused_in_one_sentence(self, command_line, arguments, said):
         pov(YIELDS)
         for command in ("campaign", "benchmark") if "--level" in arguments else ("campaign",):
-            assert_refused(call(command, "--vut", "design1", *arguments), said)
+            assert_refused(command_line(command, "--vut", "design1", *arguments), said)
         left = {path.name for path in Path().iterdir()} - {"__pycache__"}
         assert left == {"my_pov.py"}

@@ -63,6 +63,12 @@ def run_cases(vut: ControllerKind, cases: list[Case], corridors: int = 8) -> lis
         return ground.run(cases)
 
 
+def same(ones: list[Trajectory], others: list[Trajectory]) -> bool:
+    """Return whether cases end alike, with the same motions to the last bit."""
+    pairs = zip(ones, others, strict=True)
+    return all(a.end is b.end and np.array_equal(a.motion, b.motion) for a, b in pairs)
+
+
 def run_on(
     vut: ControllerKind, scenario: Scenario, level: int, count: int, corridors: int = 8
 ) -> list[Trajectory]:

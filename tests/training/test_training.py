@@ -192,6 +192,7 @@ def test_refinement_lowers_the_regret():
     assert (best - after).mean() < 0.5 * (best - before).mean()
 
 
+@pytest.mark.slow
 class TestTraining:
     """`merge-sumo train`, end to end and very small, for a scenario on the shipped road."""
 
@@ -214,7 +215,6 @@ class TestTraining:
         assert done.exit_code == 0, done.output
         return out, done.output
 
-    @pytest.mark.slow
     def test_the_regret_is_printed_and_the_manifest_has_the_scenario_and_the_limit(self, trained):
         folder, said = trained
         assert "network  mean regret" in said
@@ -231,14 +231,12 @@ class TestTraining:
         with pytest.raises(UserError, match="accelerations of its own, down to -2 m/s2"):
             export_onnx("pov1", folder / "pov1.onnx", folder)
 
-    @pytest.mark.slow
     def test_a_network_has_a_log(self, trained):
         lines = (trained[0] / "pov1.training.jsonl").read_text().splitlines()
         first, last = json.loads(lines[0]), json.loads(lines[-1])
         assert (first["network"], first["stage"], first["done"]) == ("pov1", "ddqn", TINY.updates)
         assert (last["stage"], last["done"]) == ("refine", QUICK.rounds)
 
-    @pytest.mark.slow
     def test_a_finished_network_is_trained_again_for_no_other_plan(self, trained, monkeypatch):
         folder, _ = trained
         monkeypatch.setattr(helix, "LEVEL_SETTINGS", {1: SMALL, 2: SMALL})
@@ -252,21 +250,18 @@ class TestTraining:
                 train_library(folder, ("pov1",), **limited | other)
         assert (folder / "pov1.safetensors").stat().st_mtime_ns == before
 
-    @pytest.mark.slow
     def test_the_drivers_know_the_scenario_and_the_shipped_ones_do_not(self, trained, ring):
         assert unseen(LIKE_A_ROUNDABOUT, trained[0]) == []
         said = invoke("scenario", "check", ring).output
         assert "a_min_mps2 -4 is like -8.51 in us23 (trained on -4)" in said
         assert f"merge-sumo train --scenario {ring} --out ring-policies" in said
 
-    @pytest.mark.slow
     def test_a_check_measures_the_regret_on_the_scenario(self, trained, ring):
         words = ("train", "--check", "--only", "pov1", "--cases", 4, "--json", "--out", trained[0])
         done = invoke(*words, "--scenario", ring)
         assert json.loads(done.stdout)["pov1"] == read_manifest(trained[0])["pov1"]["check"]
         assert "was trained for ring: say with `scenario`" in str(invoke(*words).exception)
 
-    @pytest.mark.slow
     def test_a_process_that_ends_is_a_sentence(self, tmp_path, monkeypatch):
         monkeypatch.setattr(helix, "_train_one", os._exit)
         with pytest.raises(UserError, match="the process that trains pov1 has ended"):
