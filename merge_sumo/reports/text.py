@@ -479,8 +479,8 @@ def timelines(run: RecordedCampaign, outcomes: Sequence[Outcome]) -> dict[int, T
 def _avoidance(one: Avoidance) -> list[Event]:
     """Return who would have avoided a failure from its start, and until when by taking over."""
     by = either(one.avoided_by) if one.avoided_by else "no reference driver"
-    text = f"from here on {by} in the place of the VUT would have avoided it"
-    events = [Event(0.0, f"{text}; so would a careful POV" if one.pov_careful else text)]
+    text = f"avoidable from the start by {by} in the VUT's place"
+    events = [Event(0.0, f"{text}; a careful POV avoids it" if one.pov_careful else text)]
     if one.latest_takeover_s is not None:
         text = f"last moment at which the reference driver {TAKES_OVER} could take over"
         events.append(Event(one.latest_takeover_s, text))

@@ -104,11 +104,15 @@ def test_stand_on_the_first_screen(made):
     def said(name: str) -> list[str]:
         return [" ".join(one.text_content().split()) for one in page.find_class(name)]
 
-    rule = "A case fails with front bumpers within 6 m when the VUT reaches the merge point."
-    assert said("sentence") == [f"180 cases of us23 by the sampler uniform. {rule}"]
-    assert "2 more cases with contact: --fail-when unsafe counts them" in said("strip")[0]
+    assert said("sentence") == [
+        "The vehicle under test (VUT) is handmade, on the road us23: 180 cases against another"
+        " vehicle (POV) that reacts at three levels. A case fails with front bumpers within 6 m"
+        " when the VUT reaches the merge point."
+    ]
+    assert "their front bumpers are more than 6 m apart at the merge point" in said("strip")[0]
     avoided = page.xpath("//div[@class='avoided']//dd/text()")
-    assert avoided == ["1", "0", "0", "1", "1"], "by careful, fsm, reg157, rss, and a careful POV"
+    # By careful, fsm, reg157, rss, and a careful POV.
+    assert avoided == [f"{number} of 60" for number in (1, 0, 0, 1, 1)]
     none, some, unknown = said("map")
     assert "< 0.15 % of all starts fail" in none
     assert "1.1 % of all starts fail" in some

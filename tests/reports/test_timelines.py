@@ -186,7 +186,7 @@ def check_moment(text: str, row: int, m: Motion) -> None:
     elif text.startswith("the VUT did not reach "):
         assert not m.arrived
     else:
-        assert re.match("from here on |last moment at which |fails: margin ", text), text
+        assert re.match("avoidable from |last moment at which |fails: margin ", text), text
 
 
 def needed_mps2(m: Motion) -> float:
@@ -288,7 +288,7 @@ class TestTheTimeline:
         outcome = next(o for o in run.cases if o.failed)
         index, told = outcome.index, timelines(run, [outcome])[outcome.index]
         _, *lines = told.lines(outcome.case)
-        without = [line for line in lines if "reference" not in line and "from here" not in line]
+        without = [line for line in lines if "reference" not in line and "avoidable" not in line]
         assert ms.explain(run.folder, index).lines()[1 : len(lines) + 1] == lines
         ran = ms.run(recorded=(run.folder, index))
         assert ran.lines()[1 : len(without) + 1] == without

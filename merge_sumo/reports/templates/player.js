@@ -19,6 +19,7 @@ function draw(parent, tag, attributes = {}, text = null) {
 }
 const clamp = (value, low, high) => Math.min(Math.max(value, low), high);
 const fixed = (value, digits) => value.toFixed(digits).replace("-", "\u2212");
+const signed = (text) => text.replace(/(^|[\s(])-(?=[\d.])/g, "$1\u2212");
 const bytes = (text) => Uint8Array.from(atob(text), (c) => c.charCodeAt(0));
 const path = (points) => points.map(([x, y], i) => `${i ? "L" : "M"}${x.toFixed(2)} ${y.toFixed(2)}`).join("");
 
@@ -188,7 +189,7 @@ function TopView(svg) {
       for (const part of [group, outline]) part.setAttribute("transform", `translate(${x} ${-y}) rotate(${angle}) scale(${larger})`);
       brake.setAttribute("visibility", a < -0.2 ? "visible" : "hidden");
       const up = (who === VUT) === vutAbove, named = who === VUT || who === POV;
-      label.setAttribute("x", clamp(x - 2.5, middle - aside, middle + aside));
+      label.setAttribute("x", clamp(x + 3.6 * letters, middle - aside, middle + aside)); // ahead of the front bumper: the ramp is behind it
       const below = -y + (up ? -3.8 * Math.min(size, 2) - letters : 2.8 * Math.min(size, 2) + letters);
       label.setAttribute("y", clamp(below, letters - centre - height / 2, height / 2 - centre - 0.4 * letters));
       label.style.fontSize = `${letters}px`;

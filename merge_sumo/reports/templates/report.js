@@ -39,13 +39,12 @@ const rank = (i) => (severity(i) === null ? data.severities.length : data.severi
 const valueText = (c, value) => `${fixed(value, c.digits)} ${c.unit}`;
 
 function title(i) {
-  const place = coordinates.filter((c) => cases[c.field][i] !== null).map((c) => `${c.name} ${valueText(c, cases[c.field][i])}`);
-  return `Case ${cases.index[i]} · POV level ${data.level_names[cases.level[i]]}, ${place.join(", ")}`;
+  const place = coordinates.filter((c) => cases[c.field][i] !== null).map((c) => `${c.name} ${valueText(c, cases[c.field][i])}`.replaceAll(" ", "\u00a0"));
+  return `POV level ${data.level_names[cases.level[i]]}, ${place.join(", ")}`;
 }
 function words(i) {
-  const margin = cases.margin[i] === null || !tested(i) ? "" : `${undecided(i) ? "Undecided" : failed(i) ? "Fails" : "Does not fail"}: margin ${cases.margin[i]}.`;
   const { [i]: result } = cases.result;
-  return [`${result[0].toUpperCase()}${result.slice(1)}.`, margin, runsInWords(i)].filter(Boolean).join(" ");
+  return signed([`${result[0].toUpperCase()}${result.slice(1)}.`, runsInWords(i)].filter(Boolean).join(" "));
 }
 
 /* ---------- grids: the surrogate's failure probability ---------- */
@@ -76,7 +75,7 @@ function shade(svg, values, nx, ny, box, clip) {
 }
 
 /* ---------- maps ---------- */
-const BOX = [44, 6, 350, 184]; // x, y, width, height of the plot in a map
+const BOX = [48, 6, 346, 184]; // x, y, width, height of the plot in a map
 const unit = (c, value) => (value - c.low) / (c.high - c.low);
 let chosen = -1;
 const maps = [...document.querySelectorAll(".map")].map((figure) => new FailureMap(figure));
@@ -143,9 +142,9 @@ function FailureMap(figure) {
   this.move = (value, everything) => {
     at = value; all = everything;
     slider.value = value;
-    check.checked = all;
+    check.checked = slider.disabled = all;
     const degrees = third.unit === "rad" ? ` (${Math.round(value * 180 / Math.PI)}°)` : "";
-    figure.querySelector("output").textContent = all ? "all values" : valueText(third, value) + degrees;
+    figure.querySelector("output").textContent = all ? "" : valueText(third, value) + degrees;
     this.draw();
   };
   this.showAll = () => (third ? this.move(at, true) : this.draw());
@@ -196,7 +195,7 @@ function FailureMap(figure) {
   svg.addEventListener("click", (event) => { const mark = under(event); if (mark) openCase(mark.i, drawn(mark.i)); });
   svg.addEventListener("pointermove", (event) => {
     const mark = event.pointerType === "touch" ? null : under(event);
-    mark ? tip(event, title(mark.i)) : tip(null);
+    mark ? tip(event, `Case ${cases.index[mark.i]} · ${title(mark.i)}`) : tip(null);
   });
   svg.addEventListener("pointerleave", () => tip(null));
   svg.addEventListener("keydown", (event) => {
@@ -298,18 +297,18 @@ byId("close").addEventListener("click", () => dock(false));
 function show(i) {
   chosen = i;
   for (const map of maps) map.lookAt(i);
-  byId("case-title").textContent = title(i);
+  byId("case-start").textContent = ` · ${title(i)}`;
   byId("case-words").textContent = words(i);
   const link = byId("case-link");
-  link.hidden = false;
   link.href = address(i);
-  link.textContent = `#case-${cases.index[i]}`;
+  link.textContent = `Case ${cases.index[i]}`;
   for (const place of document.querySelectorAll("code .index")) place.textContent = cases.index[i];
   for (const map of maps) map.choose();
   for (const button of document.querySelectorAll("[data-case]")) {
     button.closest("tr")?.classList.toggle("on", Number(button.dataset.case) === cases.index[i]);
   }
   byId("case-role").textContent = cases.index[i] !== Number(panel.dataset.first) ? verdict(i) : failed(i) ? `worst case${undecided(i) ? ", undecided" : ""}` : tested(i) ? "no failure, but the nearest to one" : verdict(i);
+  byId("case-role").title = cases.margin[i] === null || !tested(i) ? "" : `margin ${fixed(cases.margin[i], 3)}${failed(i) && cases.index[i] === Number(panel.dataset.first) ? ": the lowest of all cases" : ""}`;
   moving = motion(i);
   byId("case-motion").hidden = moving === null;
   byId("why").hidden = !failed(i) || moving === null;
@@ -327,7 +326,8 @@ function showMotion(i) {
 }
 function timeline(i) { // the events of a case as a list, and as marks on the time axis of the player
   const marks = [], lines = [], end = moving && (moving.rows - 1) * DT;
-  for (const [t, text, car] of cases.events[i]) {
+  for (const [n, [t, words, actor]] of cases.events[i].entries()) {
+    const text = signed(words), car = n + 1 < cases.events[i].length ? actor : null; // the last one is the outcome
     const line = document.createElement("li"), button = document.createElement("button");
     Object.assign(button, { type: "button", textContent: `${fixed(t, 1)} s`, disabled: !moving });
     button.addEventListener("click", () => { play(false); at(t / DT); });
@@ -349,7 +349,7 @@ function whyCharts(i) { // with which changes a failure passes
   byId("why-known").hidden = !found;
   byId("why-ask").hidden = Boolean(found);
   if (!found) return;
-  byId("why-words").replaceChildren(...found.words.map((text) => Object.assign(document.createElement("li"), { textContent: text })));
+  byId("why-words").replaceChildren(...found.words.map((text) => Object.assign(document.createElement("li"), { textContent: signed(text) })));
   drawAxes(byId("why-changes"), found.axes);
 }
 function drawAxes(svg, axes) { // a bar for each thing: what fails around the case, and the nearest values that pass
@@ -561,6 +561,10 @@ function search() {
   const most = Math.max(...levels.flatMap(({ fmc }) => fmc), 0.001);
   plot(byId("chart-fmc"), { xRange: [0, numbers[numbers.length - 1]], xLabel: "cases", yRange: [0, 1.1 * most], lines });
 }
+
+// Numbers of the page as those of maps and charts; what others wrote, and what may be copied into a shell, stays.
+const texts = document.createTreeWalker(document.body, NodeFilter.SHOW_TEXT);
+while (texts.nextNode()) if (!texts.currentNode.parentElement.closest("script, code, pre, .message, .note, .settings, .untested, h1, option")) texts.currentNode.data = signed(texts.currentNode.data);
 
 const filter = allCases();
 restore();
