@@ -15,7 +15,7 @@ from lxml import etree, html
 from support.calling import assert_refused
 from support.campaigning import campaign_settings, run_campaign
 from support.handmade import drive
-from support.histories import ended
+from support.histories import CASE, ended
 
 from merge_sumo.analysis.comparison import Change, ComparedCase, compare
 from merge_sumo.analysis.rerun import rerun
@@ -28,11 +28,10 @@ from merge_sumo.metrics.measures import Measures
 from merge_sumo.metrics.outcome import Episode, Outcome
 from merge_sumo.reports import comparison_page as pages
 from merge_sumo.reports.text import change_in_words
-from merge_sumo.scenario.case import Case, from_unit
+from merge_sumo.scenario.case import from_unit
 from merge_sumo.scenario.scenario import US23
 from merge_sumo.scenario.trajectory import End
 
-CASE = Case(level=0, x_pov0_m=-273.0, v_pov0_mps=33.0, scenario=US23)
 Point = tuple[float, float, str]
 
 

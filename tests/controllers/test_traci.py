@@ -21,6 +21,7 @@ from support.controllers import (
     free_port,
     program,
 )
+from support.histories import CASE
 from support.processes import none_left
 from support.vut_contract import cases_of, factory, run_cases, run_on
 
@@ -31,11 +32,9 @@ from merge_sumo.drivers.base import Scene
 from merge_sumo.errors import UserError
 from merge_sumo.road.loader import road_of
 from merge_sumo.road.scenario_file import named_scenario
-from merge_sumo.scenario.case import Case
 from merge_sumo.scenario.scenario import DT_S, US23, VUT
 from merge_sumo.scenario.trajectory import End
 
-CASE = Case(level=0, x_pov0_m=-250.0, v_pov0_mps=30.0, scenario=US23)
 PAGE = (Path(__file__).parents[2] / "docs/tutorials/traci-controller.md").read_text(
     encoding="utf-8"
 )

@@ -7,15 +7,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+from support.histories import CASE
 
 from merge_sumo.errors import UserError
 from merge_sumo.metrics.bodies import CentreLines
 from merge_sumo.metrics.merge import Conflict, check_from
-from merge_sumo.scenario.case import Case, FloatArray
+from merge_sumo.scenario.case import FloatArray
 from merge_sumo.scenario.scenario import US23
 from merge_sumo.scenario.trajectory import End, Trajectory, cut_at
-
-CASE = Case(level=0, x_pov0_m=-250.0, v_pov0_mps=30.0, scenario=US23)
 
 
 def motion(gaps_m: list[float], closing_mps: list[float]) -> FloatArray:

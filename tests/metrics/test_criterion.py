@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from metrics.test_score import CASE, ending
+from metrics.test_score import ending
+from support.histories import CASE
 
 from merge_sumo.errors import UserError
 from merge_sumo.metrics.bodies import SPACING_M, CentreLines, encounters

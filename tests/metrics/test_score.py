@@ -11,15 +11,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from metrics.test_timeline import drive
+from support.histories import CASE
 
 from merge_sumo.metrics.measures import Measures, sustained_brake_mps2
 from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.metrics.paper import FAILURE_SCORE, time_to_collision
-from merge_sumo.scenario.case import Case
-from merge_sumo.scenario.scenario import DT_S, POV, US23, VUT
+from merge_sumo.scenario.scenario import DT_S, POV, VUT
 from merge_sumo.scenario.trajectory import End, Trajectory
-
-CASE = Case(level=0, x_pov0_m=-250.0, v_pov0_mps=30.0, scenario=US23)
 
 
 def ending(dx, v_pov=30.0, v_vut=26.0, end=End.MERGED, steps=10, a_vut=0.0):

@@ -9,7 +9,8 @@ from importlib.util import find_spec
 import numpy as np
 import pytest
 from conftest import require
-from metrics.test_score import CASE, ending
+from metrics.test_score import ending
+from support.histories import CASE
 
 from merge_sumo.errors import UserError
 from merge_sumo.metrics.criterion import Criterion

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import importlib
+import sys
 
 import numpy as np
 import pytest
@@ -47,10 +47,8 @@ def test_a_case_is_drawn_over_time_with_its_events(run):
 def test_html_has_maps_or_says_what_is_missing(run, monkeypatch):
     assert "</pre><img alt=" in run._repr_html_()
 
-    def refuse(name: str):
-        raise ModuleNotFoundError(name=name)
-
-    monkeypatch.setattr(importlib, "import_module", refuse)
+    for name in ("matplotlib", "pandas"):
+        monkeypatch.setitem(sys.modules, name, None)
     assert "<p>this needs matplotlib: pip install 'merge-sumo[plot]'</p>" in run._repr_html_()
     with pytest.raises(UserError, match=r"needs pandas: pip install 'merge-sumo\[notebook\]'"):
         run.to_dataframe()

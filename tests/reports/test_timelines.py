@@ -11,7 +11,6 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from dataclasses import replace
-from functools import cache
 from pathlib import Path
 
 import pytest
@@ -248,30 +247,20 @@ def check_complete(told: Timeline, m: Motion) -> None:
                 assert any(s == sign and a < row + 10 and row < b for s, a, b in phases)
 
 
-@pytest.fixture(scope="module")
-def campaign_of(tmp_path_factory) -> Callable[[str], RecordedCampaign]:
-    """Return the function that runs the campaign of a controller, once."""
-
-    @cache
-    def run(vut: str) -> RecordedCampaign:
-        folder = tmp_path_factory.mktemp("timelines")
-        settings = CampaignSettings(
-            vut=spec_of(vut, folder),
-            levels=(0, 1, 2),
-            cases=CASES,
-            batch=10,
-            seed=11,
-            scenario=ON_LANE if vut.startswith("stop:") else US23,
-            fail_when="paper",
-        )
-        return run_campaign(settings, folder / "run")
-
-    return run
-
-
-@pytest.fixture(params=VUTS)
-def campaign(request, campaign_of) -> RecordedCampaign:
-    return campaign_of(request.param)
+@pytest.fixture(scope="module", params=VUTS)
+def campaign(request, tmp_path_factory) -> RecordedCampaign:
+    """Return the campaign of a controller."""
+    folder = tmp_path_factory.mktemp("timelines")
+    settings = CampaignSettings(
+        vut=spec_of(request.param, folder),
+        levels=(0, 1, 2),
+        cases=CASES,
+        batch=10,
+        seed=11,
+        scenario=ON_LANE if request.param.startswith("stop:") else US23,
+        fail_when="paper",
+    )
+    return run_campaign(settings, folder / "run")
 
 
 class TestTheTimeline:
@@ -283,17 +272,17 @@ class TestTheTimeline:
                 check(told, outcome, motion)
                 check_complete(told, motion)
 
-    def test_is_told_wherever_the_case_is_shown(self, campaign_of, tmp_path):
-        run = campaign_of("design1")
-        outcome = next(o for o in run.cases if o.failed)
-        index, told = outcome.index, timelines(run, [outcome])[outcome.index]
+    @pytest.mark.parametrize("campaign", ["design1"], indirect=True)
+    def test_is_told_wherever_the_case_is_shown(self, campaign, tmp_path):
+        outcome = next(o for o in campaign.cases if o.failed)
+        index, told = outcome.index, timelines(campaign, [outcome])[outcome.index]
         _, *lines = told.lines(outcome.case)
         without = [line for line in lines if "reference" not in line and "avoidable" not in line]
-        assert ms.explain(run.folder, index).lines()[1 : len(lines) + 1] == lines
-        ran = ms.run(recorded=(run.folder, index))
+        assert ms.explain(campaign.folder, index).lines()[1 : len(lines) + 1] == lines
+        ran = ms.run(recorded=(campaign.folder, index))
         assert ran.lines()[1 : len(without) + 1] == without
         assert ran.timeline.events[-1] == told.events[-1]
-        assert ms.replay(run.folder, index).lines()[1:-1] == without
-        write_junit(tmp_path / "junit.xml", ms.open_run(run.folder))
+        assert ms.replay(campaign.folder, index).lines()[1:-1] == without
+        write_junit(tmp_path / "junit.xml", ms.open_run(campaign.folder))
         failures = etree.parse(tmp_path / "junit.xml").iter("failure")
         assert told.in_a_line in [one.text for one in failures]

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.histories import ended
+from support.histories import CASE, ended
 
 from merge_sumo.metrics.outcome import Prediction
 from merge_sumo.samplers.predictions import (
@@ -16,10 +16,6 @@ from merge_sumo.samplers.predictions import (
     gain_factor,
     model_weight,
 )
-from merge_sumo.scenario.case import Case
-from merge_sumo.scenario.scenario import US23
-
-CASE = Case(level=0, x_pov0_m=-273.0, v_pov0_mps=33.0, scenario=US23)
 
 
 def outcome(*, failed, model=0.5, surrogate=0.5, p_fail=0.5, predicted=True):

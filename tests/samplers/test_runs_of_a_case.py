@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.histories import ended
+from support.histories import CASE, ended
 
 from merge_sumo.samplers.history import LevelHistory
 from merge_sumo.samplers.registry import make_sampler
@@ -16,7 +16,6 @@ from merge_sumo.samplers.surrogate import Surrogate
 from merge_sumo.scenario.case import Case, Pool
 from merge_sumo.scenario.scenario import US23
 
-CASE = Case(level=0, x_pov0_m=-260.0, v_pov0_mps=30.0, scenario=US23)
 OTHER = replace(CASE, v_pov0_mps=31.0)
 
 

@@ -8,8 +8,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from metrics.test_score import CASE, ending
+from metrics.test_score import ending
 from support.handmade import FOLLOWED_UP
+from support.histories import CASE
 from support.vut_contract import in_process, run_cases
 
 from merge_sumo.errors import UserError

@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 import subprocess
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 
 from support.traci_pair import (
     Pair,
@@ -49,12 +49,9 @@ def lit_crossing(folder):
 
 
 def test_questions_of_collisions_get_what_a_real_sumo_says(tmp_path):
-    pair = Pair(tmp_path, pov=(-184.0, 18.0), change_mps=0.0, steps=110)
-    try:
+    with closing(Pair(tmp_path, pov=(-184.0, 18.0), change_mps=0.0, steps=110)) as pair:
         question = "simulation", "getCollisions", ()
         ours, real = answer(pair.ours, *question), answer(pair.real, *question)
-    finally:
-        pair.close()
     assert "'collider': \"'pov'\"" in ours
     assert ours == real
 

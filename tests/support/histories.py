@@ -11,9 +11,12 @@ from merge_sumo.metrics.measures import Measures
 from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.samplers.history import LevelHistory
 from merge_sumo.scenario.case import Case
+from merge_sumo.scenario.scenario import US23
 from merge_sumo.scenario.trajectory import End
 
 FloatArray = np.ndarray
+CASE = Case(level=0, x_pov0_m=-250.0, v_pov0_mps=30.0, scenario=US23)
+"""A case for outcomes and motions that are made by hand."""
 
 
 def ended(
