@@ -8,14 +8,14 @@ import shutil
 from dataclasses import replace
 
 import pytest
-from support.campaigning import run_campaign
+from support.campaigning import campaign_settings, run_campaign
 from support.plans import plan_for
 from support.scenes import scene_of
 
 from merge_sumo.analysis.counterfactuals import AVOIDANCE, avoidances, write_avoidance
 from merge_sumo.analysis.run_study import RunStudy
 from merge_sumo.campaigns.recorded import RecordedCampaign, failures
-from merge_sumo.campaigns.settings import CampaignSettings, controllers, settings_from_folder
+from merge_sumo.campaigns.settings import controllers, settings_from_folder
 from merge_sumo.controllers.spec import ControllerOptions
 from merge_sumo.drivers.policies import policies_of
 from merge_sumo.drivers.reference_drivers import REFERENCE_DRIVERS, CarefulPov
@@ -80,10 +80,9 @@ def test_every_failure_names_who_would_have_avoided_it(run, found):
 
 def test_on_a_lane_it_names_the_drivers_that_pass_as_the_vut(tmp_path):
     road = named_scenario("us23-lane")
-    settings = CampaignSettings(
+    settings = campaign_settings(
         vut="level0",
         scenario=road,
-        levels=(0,),
         sampler="uniform",
         cases=80,
         seed=4,

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import pytest
-from support.campaigning import run_campaign
+from support.campaigning import campaign_settings, run_campaign
 from support.histories import ended
 
 from merge_sumo import api
 from merge_sumo.campaigns import recorded as campaign_folder
 from merge_sumo.campaigns.recorded import WINDOW, has_converged
-from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.scenario.case import Case
 from merge_sumo.scenario.scenario import US23
@@ -45,10 +45,9 @@ def test_a_campaign_stops_early_and_its_outcomes_are_a_beginning_of_the_whole(
     tmp_path, monkeypatch
 ):
     monkeypatch.setattr(campaign_folder, "WINDOW", 20)
-    plan: dict[str, Any] = {"vut": "design1", "levels": (0,), "cases": 120, "scenario": US23}
-    plan["sampler"] = "annealing"
-    whole = run_campaign(CampaignSettings(**plan), tmp_path / "whole")
-    early = run_campaign(CampaignSettings(**plan, stop_when_converged=True), tmp_path / "early")
+    settings = campaign_settings(vut="design1", sampler="annealing", cases=120)
+    whole = run_campaign(settings, tmp_path / "whole")
+    early = run_campaign(replace(settings, stop_when_converged=True), tmp_path / "early")
     assert 20 < len(early.outcomes) < len(whole.outcomes) == 120
     text = (tmp_path / "whole" / "outcomes.jsonl").read_bytes()
     assert text.startswith((tmp_path / "early" / "outcomes.jsonl").read_bytes())

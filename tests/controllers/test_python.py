@@ -12,6 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from support.packages import install
 from support.vut_contract import LEVEL0_CLASS, cases_of, factory, in_process, run_cases, same
 
 from merge_sumo.errors import UserError
@@ -45,13 +46,8 @@ def test_a_module_in_the_working_folder_is_found(write_vut, tmp_path, monkeypatc
 
 
 def test_an_installed_package_can_register_a_name(tmp_path, monkeypatch):
-    (tmp_path / "registered_vut.py").write_text(LEVEL0_CLASS)
-    info = tmp_path / "registered_vut-1.dist-info"
-    info.mkdir()
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: registered-vut\nVersion: 1\n")
-    (info / "entry_points.txt").write_text(
-        "[merge_sumo.vuts]\nmine = registered_vut:Level0\nbad = registered_vut:Nothing\n"
-    )
+    entries = "mine = registered_vut:Level0\nbad = registered_vut:Nothing"
+    install(tmp_path, "registered_vut", LEVEL0_CLASS, "merge_sumo.vuts", entries)
     monkeypatch.syspath_prepend(tmp_path)
     assert run_cases(in_process("mine"), cases_of(3))[0].end is End.MERGED
     with pytest.raises(UserError, match="registered_vut has no 'Nothing'"):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 
 import pytest
+from support import packages
 
 from merge_sumo.errors import UserError
 from merge_sumo.registry import Registry
@@ -25,11 +26,7 @@ def install(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(tmp_path)
 
     def installed(package: str, entries: str, source: str = "class Tool: ..."):
-        (tmp_path / f"{package}.py").write_text(source)
-        info = tmp_path / f"{package}-1.dist-info"
-        info.mkdir()
-        (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {package}\nVersion: 1\n")
-        (info / "entry_points.txt").write_text(f"[{GROUP}]\n{entries}\n")
+        packages.install(tmp_path, package, source, GROUP, entries)
         # A folder on the path that is new to it: what was found before is not looked for again.
         extra = tmp_path / f"after-{package}"
         monkeypatch.syspath_prepend(extra)

@@ -12,12 +12,10 @@ import pytest
 from lxml import html
 from reports.test_browser import browser, shown  # noqa: F401 (a fixture)
 from scipy.stats import beta, binomtest
-from support.campaigning import run_campaign
+from support.campaigning import campaign_settings, run_campaign
 
 from merge_sumo.campaigns.recorded import RecordedCampaign
-from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.reports.report import REPORT, write_report
-from merge_sumo.scenario.scenario import US23
 
 CONTROLLERS = Path(__file__).parents[1] / "support" / "chance_vuts.py"
 TOLERATED, RUNS = 0.2, 4
@@ -25,14 +23,8 @@ TOLERATED, RUNS = 0.2, 4
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory) -> RecordedCampaign:
-    settings = CampaignSettings(
-        vut=f"{CONTROLLERS}:Slope",
-        levels=(0,),
-        cases=30 * RUNS,
-        seed=5,
-        repeat=RUNS,
-        tolerated=TOLERATED,
-        scenario=US23,
+    settings = campaign_settings(
+        vut=f"{CONTROLLERS}:Slope", cases=30 * RUNS, seed=5, repeat=RUNS, tolerated=TOLERATED
     )
     run = run_campaign(settings, tmp_path_factory.mktemp("chance") / "run")
     write_report(run)

@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from support.campaigning import campaign_settings
 
 from merge_sumo.campaigns.campaign import controller_model_of
-from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.metrics.criterion import PAPER
 from merge_sumo.metrics.regression import regression
 from merge_sumo.samplers.controller_model import ControllerModelPair
@@ -31,9 +31,7 @@ def test_large_margins_are_drawn_in():
 def searched(limit_m: float, fail_when: str, cases: int, vut: str = "level0"):
     """Return settings, plan, points, (n, d), outcomes and motions of a scenario with a limit."""
     scenario = replace(US23, dx_crash_m=limit_m, dx_critical_m=max(limit_m, US23.dx_critical_m))
-    settings = CampaignSettings(
-        vut=vut, levels=(0,), cases=cases, scenario=scenario, fail_when=fail_when
-    )
+    settings = campaign_settings(vut=vut, cases=cases, scenario=scenario, fail_when=fail_when)
     points = np.random.default_rng(7).random((cases, 2))
     plan = settings.load_plan().with_engine("kinematic")
     ran = simulate(plan, settings.pool.cases(points, 0))
