@@ -250,7 +250,7 @@ def test_commands_in_vain_are_named_in_the_end(tmp_path, command_line):
     campaign = ("--cases", 3, "--sampler", "uniform", "--level", 0, "--workers", 1)
     _, out, _ = command_line("campaign", "--vut", vut, *campaign, "-q", "--out", tmp_path / "run")
     note = "commanded in vain, because it changes nothing here: vehicle.changeSublane in 3 cases"
-    assert f"note: {note}" in out.splitlines()
+    assert f"Note:        {note}" in out.splitlines()
 
 
 def test_output_of_every_start_of_a_program_is_shown(tmp_path, capfd):
