@@ -21,7 +21,7 @@ from merge_sumo.metrics.merge import Severity
 from merge_sumo.metrics.outcome import Episode, Outcome
 from merge_sumo.records import Record, replaced, to_plain
 from merge_sumo.result import Result
-from merge_sumo.scenario.case import Case, coordinates
+from merge_sumo.scenario.case import Case
 from merge_sumo.scenario.scenario import Coordinate, level_name
 from merge_sumo.simulation.evaluate import evaluate
 from merge_sumo.simulation.plan import Engine, SimulationPlan
@@ -234,7 +234,7 @@ class _Search:
                 (passes,) = self._passes(plan, [trial])
                 levels[level_name(level)] = self._reported[trial] = passes
         start = []
-        for c in coordinates(case.scenario, (case.level,)):
+        for c in case.scenario.dimensions(case.level):
             axis = _axis(c.field, getattr(case, c.field), c, START_STEPS)
             start.append(self._searched(axis, self._with_start))
         parameters = []

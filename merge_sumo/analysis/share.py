@@ -21,7 +21,7 @@ from merge_sumo.controllers.process import LOG
 from merge_sumo.errors import UserError
 from merge_sumo.metrics.summary import clopper_pearson, summarise
 from merge_sumo.records import Record
-from merge_sumo.scenario.case import Case, Pool
+from merge_sumo.scenario.case import Case, from_unit
 from merge_sumo.scenario.scenario import Scenario
 from merge_sumo.simulation.evaluate import evaluate
 from merge_sumo.workers import Workers
@@ -156,4 +156,4 @@ def uniform_cases(scenario: Scenario, level: int, count: int, seed: int) -> list
     """
     rng = np.random.default_rng([seed, STREAM, level])
     points = rng.random((count, len(scenario.dimensions(level))))
-    return Pool(levels=(level,), scenario=scenario).cases(points, level)
+    return from_unit(points, level, scenario=scenario)

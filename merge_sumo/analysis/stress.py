@@ -160,10 +160,6 @@ def _with_actuator(plan: SimulationPlan, **values: float) -> SimulationPlan:
     return _changed(plan, act=replace(act, **values))
 
 
-def _with_long_pov(plan: SimulationPlan) -> SimulationPlan:
-    return _changed(plan, pov_length_m=plan.scenario.pov_length_m + CAR_LENGTH_M)
-
-
 def _changed(plan: SimulationPlan, **changes: Any) -> SimulationPlan:
     scenario = replace(plan.scenario, **changes)
     plan.criterion.check(scenario)
@@ -210,7 +206,7 @@ RUNGS = (
     Disturbance(
         "long-pov",
         f"cars of the mainline are {CAR_LENGTH_M:g} m longer, to the rear",
-        plan=_with_long_pov,
+        plan=lambda plan: _changed(plan, pov_length_m=plan.scenario.pov_length_m + CAR_LENGTH_M),
     ),
 )
 """The ladder; the first rung shows whether cases repeat at all."""

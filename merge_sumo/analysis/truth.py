@@ -29,7 +29,7 @@ from merge_sumo.metrics.fmc import fmc, growth_bound, regions
 from merge_sumo.metrics.outcome import Episode
 from merge_sumo.records import decode, read_arrays
 from merge_sumo.result import Result
-from merge_sumo.scenario.case import FloatArray, Pool
+from merge_sumo.scenario.case import FloatArray, from_unit
 from merge_sumo.scenario.scenario import OWN, Scenario
 from merge_sumo.simulation.evaluate import evaluate
 from merge_sumo.simulation.plan import SimulationPlan
@@ -142,7 +142,7 @@ def ground_truth(
     check_private(path.parent)
     rng = np.random.default_rng([seed, level])
     points = rng.random((cases, len(plan.scenario.dimensions(level))))
-    uniform = Pool(levels=(level,), scenario=plan.scenario).cases(points, level)
+    uniform = from_unit(points, level, scenario=plan.scenario)
     margins, in_sumo = np.full(cases, np.nan), 0
     files = (plan.vut.files or {}) | plan.povs.files
     results = evaluate(plan.at_level(level), uniform, workers, _margin_of)

@@ -12,7 +12,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from functools import partial
 from typing import Final
 
 import numpy as np
@@ -26,7 +25,7 @@ from merge_sumo.printable import counted
 from merge_sumo.records import Record, read_indexed, to_json
 from merge_sumo.scenario.scenario import DT_S, OWN, EpisodeTime
 from merge_sumo.scenario.trajectory import End, Trajectory
-from merge_sumo.simulation.evaluate import lost_episode, simulate_part, with_measures
+from merge_sumo.simulation.evaluate import evaluate, with_measures
 from merge_sumo.simulation.plan import SimulationPlan
 from merge_sumo.workers import Workers
 
@@ -78,10 +77,8 @@ def check_repeatability(
         return
     second_runs = []
     cases = [outcome.case for outcome in outcomes]
-    job = workers.submit(
-        partial(simulate_part, plan, keep=with_measures), cases, partial(lost_episode, plan)
-    )
-    for outcome, episode in zip(outcomes, workers.collect(job), strict=True):
+    episodes = evaluate(plan, cases, workers, with_measures)
+    for outcome, episode in zip(outcomes, episodes, strict=True):
         if not episode.outcome.measures.end.is_error:  # of a slow machine, perhaps
             second_runs.append(second_run_of(outcome, run.trajectory(outcome.index), episode))
     second_runs.sort(key=lambda second: second.index)
@@ -150,12 +147,11 @@ def difference(one: Trajectory, other: Trajectory) -> float | None:
     rows = min(len(one.whole), len(other.whole))
     first, second = one.whole[:rows].copy(), other.whole[:rows].copy()
     first[-1, :, 2] = second[-1, :, 2] = 0.0  # a last acceleration is 0 by definition
-    differs = first != second
-    steps = np.flatnonzero(differs.any(axis=(1, 2)))
-    if len(steps):
-        return round(int(steps[0]) * DT_S, 1)
-    same = len(one.whole) == len(other.whole)
-    return None if same else round((rows - 1) * DT_S, 1)
+    differs = (first != second).any(axis=(1, 2))
+    if not differs.any() and len(one.whole) == len(other.whole):
+        return None
+    step = int(differs.argmax()) if differs.any() else rows - 1
+    return round(step * DT_S, 1)
 
 
 def read_second_runs(run: RecordedCampaign) -> list[SecondRun]:

@@ -142,6 +142,16 @@ def gaps_m(after: FloatArray, lengths_m: tuple[float, float]) -> tuple[FloatArra
     return np.abs(dx) - length_m, np.where(dx >= 0.0, -dv, dv)
 
 
+def times_to_collision_s(gap_m: FloatArray, closing_mps: FloatArray) -> FloatArray:
+    """Return gaps over closing speeds, in s; infinite where no gap closes.
+
+    Args:
+        gap_m: gaps, of any shape.
+        closing_mps: closing speeds, of the same shape.
+    """
+    return np.divide(gap_m, closing_mps, out=gap_m + np.inf, where=closing_mps > 0.0)
+
+
 def _apart(
     scenario: Scenario, motion: FloatArray, merged: NDArray[np.bool_], lines: CentreLines
 ) -> FloatArray:

@@ -159,12 +159,11 @@ class Criterion:
         named = CRITERIA.get(self.as_written)
         return self.as_written if named is None else named.condition
 
-    def margin(self, trajectory: Trajectory, measures: Measures) -> float | None:
+    def margin(self, measures: Measures) -> float | None:
         """Return the margin of an episode.
 
         Args:
-            trajectory: the motion.
-            measures: its measures.
+            measures: its measures; with its motion where `require` is the criterion.
 
         Returns:
             The distance from failing, below 0 for a failure, without a unit; None after an error.
@@ -174,7 +173,7 @@ class Criterion:
         if self.is_of_paper:
             return margin_of(measures.score)
         if self.require is not None:
-            return robustness(self.require, trajectory)
+            return robustness(self.require, measures.trajectory)
         condition = condition_of(self.condition)
         return condition.margin(values_of(measures, condition.names))
 
@@ -190,10 +189,9 @@ class Criterion:
             lines: centre lines of the road; None for none before M.
         """
         outcomes = []
-        measured = measures_of(trajectories, lines)
-        for index, (trajectory, measures) in enumerate(zip(trajectories, measured, strict=True)):
-            margin = self.margin(trajectory, measures)
-            outcomes.append(Outcome(index, 0, trajectory.case, measures, margin=margin))
+        for index, measures in enumerate(measures_of(trajectories, lines)):
+            margin, case = self.margin(measures), measures.trajectory.case
+            outcomes.append(Outcome(index, 0, case, measures, margin=margin))
         return outcomes
 
     def outcome(self, trajectory: Trajectory, lines: CentreLines | None = None) -> Outcome:

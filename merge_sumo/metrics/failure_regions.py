@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from merge_sumo.metrics.outcome import Outcome
-from merge_sumo.scenario.case import Case, coordinates
+from merge_sumo.scenario.case import Case
 from merge_sumo.scenario.scenario import POV, VEHICLES, VUT, Scenario
 
 DECIMALS = {"m": 0, "m/s": 1}
@@ -57,7 +57,7 @@ def _quantities(cases: Sequence[Case], scenario: Scenario) -> dict[tuple[str, st
                 due_s.append(-x_m / v_mps if v_mps > 0.0 else scenario.timeout_s)
             name = "POV" if row == POV else f"car {VEHICLES[row]}"
             values[f"{name} due at M", "s"] = due_s
-    for coordinate in coordinates(scenario, (cases[0].level,)):
+    for coordinate in scenario.dimensions(cases[0].level):
         own = [coordinate.of(case) or 0.0 for case in cases]
         values[coordinate.name, coordinate.unit] = own
     return values

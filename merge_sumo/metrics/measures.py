@@ -22,14 +22,21 @@ import inspect
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cache, cached_property
+from functools import cache
 from traceback import extract_tb
 from typing import Any, Generic, Literal, TypeVar
 
 import numpy as np
 
 from merge_sumo.errors import UserError
-from merge_sumo.metrics.bodies import NONE_MET, CentreLines, Encounter, encounters, gaps_m
+from merge_sumo.metrics.bodies import (
+    NONE_MET,
+    CentreLines,
+    Encounter,
+    encounters,
+    gaps_m,
+    times_to_collision_s,
+)
 from merge_sumo.metrics.merge import (
     HARSH_MPS2,
     STANDS_MPS,
@@ -161,7 +168,7 @@ class Measures:
 
     Attributes:
         trajectory: the motion of the episode.
-        lines: centre lines of the road; None for no clearance before M.
+        encounter: how near the VUT came to others; by default to none (`measures_of`).
         values: the values that are known, by name.
 
     Example:
@@ -169,21 +176,17 @@ class Measures:
         >>> measures.severity, measures.ttc_s
     """
 
-    def __init__(
-        self,
-        trajectory: Trajectory | None = None,
-        lines: CentreLines | None = None,
-        **values: Any,
-    ) -> None:
+    encounter: Encounter = NONE_MET
+
+    def __init__(self, trajectory: Trajectory | None = None, **values: Any) -> None:
         """Take an episode, or recorded values.
 
         Args:
             trajectory: the motion; None for recorded values.
-            lines: centre lines of the road; None for no clearance before M.
             values: values of measures by name.
         """
         self.trajectory: Trajectory = trajectory  # type: ignore[assignment]
-        self.lines, self.values = lines, values
+        self.values = values
 
     @classmethod
     def of(cls, trajectory: Trajectory, lines: CentreLines | None = None) -> Measures:
@@ -234,11 +237,6 @@ class Measures:
     def result(self) -> str:
         """The result of the episode in a word: its severity, or its end where it has none."""
         return self.severity or self.end.value
-
-    @cached_property
-    def encounter(self) -> Encounter:
-        """The contact of the episode, and its clearance before M."""
-        return NONE_MET if self.end.is_error else encounters([self.trajectory], self.lines)[0]
 
     @property
     def is_close(self) -> bool:
@@ -452,8 +450,7 @@ class Measures:
         gap_m, closing_mps = self._after()
         if (gap_m <= 0.0).any():
             return 0.0
-        closes = closing_mps > 0.0
-        return float((gap_m[closes] / closing_mps[closes]).min(initial=math.inf))
+        return float(times_to_collision_s(gap_m, closing_mps).min(initial=math.inf))
 
     @measure(worse="high", label="braking needed after M", only_with=FOLLOW_UP)
     def after_drac_mps2(self) -> float | None:
@@ -624,9 +621,10 @@ def measures_of(trajectories: Sequence[Trajectory], lines: CentreLines | None) -
         trajectories: the motions.
         lines: centre lines of the road; None for none before M.
     """
-    measures = [Measures(trajectory, lines) for trajectory in trajectories]
+    measures = list(map(Measures, trajectories))
     for one, encounter in zip(measures, encounters(trajectories, lines), strict=True):
-        one.encounter = NONE_MET if one.end.is_error else encounter
+        if not one.end.is_error:
+            one.encounter = encounter
     return measures
 
 

@@ -16,7 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from merge_sumo.errors import UserError
-from merge_sumo.metrics.bodies import CentreLines, encounters, gaps_m, one_lane_row
+from merge_sumo.metrics.bodies import (
+    CentreLines,
+    encounters,
+    gaps_m,
+    one_lane_row,
+    times_to_collision_s,
+)
 from merge_sumo.scenario.scenario import DT_S, VUT, Scenario
 from merge_sumo.scenario.trajectory import End, Trajectory
 
@@ -54,15 +60,12 @@ def neighbours(trajectory: Trajectory) -> list[Neighbour]:
     """
     if trajectory.end is not End.MERGED:
         return []
-    scenario, last = trajectory.case.scenario, trajectory.motion[-1]
-    x_vut, v_vut = last[VUT, :2].tolist()
-    found = []
-    for x, v in np.delete(last, VUT, axis=0)[:, :2].tolist():
-        if x >= x_vut:
-            found.append(Neighbour(True, x - x_vut - scenario.pov_length_m, v, v_vut - v))
-        else:
-            found.append(Neighbour(False, x_vut - x - scenario.vut_length_m, v, v - v_vut))
-    return found
+    at_m = trajectory.motion[-1:]
+    x_m, v_mps, _ = np.delete(at_m[0], VUT, axis=0).T
+    (gap_m,), (closing_mps,) = gaps_m(at_m, trajectory.case.scenario.lengths_m)
+    is_ahead = x_m >= at_m[0, VUT, 0]
+    columns = (is_ahead.tolist(), gap_m.tolist(), v_mps.tolist(), closing_mps.tolist())
+    return list(map(Neighbour, *columns))
 
 
 def place_of_merge_m(trajectory: Trajectory) -> float:
@@ -182,8 +185,7 @@ class Conflict(NamedTuple):
         if merges == len(whole):
             return cls(merges - 1, "the end of the episode")
         gap_m, closing_mps = gaps_m(whole[merges:], trajectory.case.scenario.lengths_m)
-        ttc_s = np.divide(gap_m, closing_mps, out=gap_m + np.inf, where=closing_mps > 0.0)
-        lowest_s = ttc_s.min(axis=1)
+        lowest_s = times_to_collision_s(gap_m, closing_mps).min(axis=1)
         row = int(lowest_s.argmin())
         if np.isinf(lowest_s[row]):
             return cls(merges + row, "the merge" if merges else "the start")

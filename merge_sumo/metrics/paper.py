@@ -38,17 +38,6 @@ def margin_of(score: float | None) -> float | None:
     return None if score is None else (score - FAILURE_SCORE) / abs(FAILURE_SCORE)
 
 
-def is_close(trajectory: Trajectory) -> bool:
-    """Return whether the VUT arrived at M with |dx| < 6 m: the paper's rule of a crash.
-
-    Args:
-        trajectory: the motion.
-    """
-    x_m, crash_m = trajectory.motion[-1, :, 0], trajectory.case.scenario.dx_crash_m
-    near = bool(abs(x_m[trajectory.nearest] - x_m[VUT]) < crash_m)
-    return trajectory.end is End.MERGED and near
-
-
 def time_to_collision(dx_m: float, dv_mps: float) -> float | None:
     """Return TTC = -dx/dv in seconds where the gap closes (dx dv < 0), else None (section VI-C).
 
@@ -74,7 +63,7 @@ def merge_score(trajectory: Trajectory) -> float | None:
         dx_m = pov[0] - vut[0]
         ttc_s = time_to_collision(dx_m, pov[1] - vut[1])
         overlap_m = scenario.dx_crash_m - abs(dx_m)
-        if is_close(trajectory):
+        if overlap_m > 0.0:
             crash = MU_CRASH
             p_safety = -1.0 - overlap_m / scenario.dx_crash_m
         else:

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from merge_sumo.errors import UserError
+from merge_sumo.metrics.bodies import gaps_m, times_to_collision_s
 from merge_sumo.metrics.expression import LEAST_MARGIN, MOST_CHARACTERS, MOST_MARGIN
 from merge_sumo.printable import printable
 from merge_sumo.scenario.case import FloatArray
@@ -126,17 +127,12 @@ def signals(trajectory: Trajectory) -> dict[str, FloatArray]:
     Args:
         trajectory: the motion.
     """
-    motion = trajectory.whole
-    scenario = trajectory.case.scenario
-    x_pov, v_pov, a_pov = motion[:, trajectory.nearest].T
-    x_vut, v_vut, a_vut = motion[:, VUT].T
-    dx, dv = x_pov - x_vut, v_pov - v_vut
-    gap = np.abs(dx) - np.where(dx >= 0.0, scenario.pov_length_m, scenario.vut_length_m)
-    closing = np.where(dx >= 0.0, -dv, dv)
-    ttc = np.full(len(gap), NEVER_S)
-    np.divide(np.maximum(gap, 0.0), closing, out=ttc, where=closing > 0.0)
-    values = (x_pov, v_pov, a_pov, x_vut, v_vut, a_vut, dx, dv, gap, np.minimum(ttc, NEVER_S))
-    return dict(zip(SIGNALS, values, strict=True))
+    pair = trajectory.whole[:, [trajectory.nearest, VUT]]
+    gap_m, closing_mps = gaps_m(pair, trajectory.case.scenario.lengths_m)
+    ttc_s = np.minimum(times_to_collision_s(np.maximum(gap_m, 0.0), closing_mps), NEVER_S)
+    pov, vut = pair[:, 0], pair[:, 1]
+    values = np.hstack([pov, vut, (pov - vut)[:, :2], gap_m, ttc_s])
+    return dict(zip(SIGNALS, values.T, strict=True))
 
 
 def robustness(text: str, trajectory: Trajectory) -> float:

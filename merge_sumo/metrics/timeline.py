@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from merge_sumo.metrics.bodies import NONE_MET, CentreLines, Encounter, encounters
-from merge_sumo.metrics.criterion import CRITERIA, PAPER, condition_of, values_of
+from merge_sumo.metrics.criterion import CRITERIA, PAPER, Criterion
 from merge_sumo.metrics.merge import Severity
 from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.metrics.summary import message_of
@@ -181,13 +181,8 @@ def _way_out(outcome: Outcome) -> Iterator[Event]:
 
 def _rule(outcome: Outcome) -> str | None:
     """Return the named criterion by which a case fails; None without one."""
-    if not outcome.failed:
-        return None
-    if outcome.is_by_score:
-        return PAPER
-    for name, criterion in CRITERIA.items():
-        condition = condition_of(criterion.condition)
-        if condition.margin(values_of(outcome.measures, condition.names)) == outcome.margin:
+    for name in CRITERIA:
+        if outcome.failed and Criterion(name).margin(outcome.measures) == outcome.margin:
             return name
     return None
 

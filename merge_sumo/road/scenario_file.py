@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from merge_sumo.errors import UserError
+from merge_sumo.errors import UserError, explained
 from merge_sumo.files import resource
 from merge_sumo.records import convert, read_toml, toml_value
 from merge_sumo.scenario.scenario import US23, Scenario
@@ -64,10 +64,8 @@ def named_scenario(name: str) -> Scenario:
 def _read(path: Path) -> Scenario:
     """Return the scenario of a file, with its net as the file names it."""
     _, record = read_toml(path, "scenario")
-    try:
+    with explained(str(path)):
         return convert({"name": path.stem, **record}, Scenario)
-    except UserError as error:
-        raise UserError(f"{path}: {error}") from error
 
 
 COMMENTS = {

@@ -280,7 +280,7 @@ def edges_of(path: LanePath) -> list[str]:
 def _types(road: Road, scenario: Scenario) -> bytes:
     root = etree.Element("additional")
     for name in VEHICLES[: scenario.vehicles]:
-        length_m = scenario.vut_length_m if name == VUT_ID else scenario.pov_length_m
+        length_m = scenario.lengths_m[name == VUT_ID]
         etree.SubElement(
             root,
             "vType",

@@ -22,7 +22,7 @@ from merge_sumo.road.finder import find_road, read_net
 from merge_sumo.road.loader import centre_lines
 from merge_sumo.road.road import LanePath, Road
 from merge_sumo.road.xml_input import to_bytes
-from merge_sumo.scenario.case import Case, FloatArray, described
+from merge_sumo.scenario.case import FloatArray, described
 from merge_sumo.scenario.scenario import (
     COLOURS,
     DT_S,
@@ -268,7 +268,7 @@ def _types(trajectory: Trajectory) -> etree._Element:
     root = etree.Element("additional")
     scenario = trajectory.case.scenario
     for name, first_mps in zip(VEHICLES, trajectory.motion[0, :, 1].tolist(), strict=False):
-        length_m = scenario.vut_length_m if name == VEHICLES[VUT] else scenario.pov_length_m
+        length_m = scenario.lengths_m[name == VEHICLES[VUT]]
         etree.SubElement(
             root,
             "vType",
@@ -363,29 +363,19 @@ def _parsed(text: str, **values: str) -> etree._Element:
 
 def _labels(outcome: Outcome, told: Timeline, view: View) -> etree._Element:
     """Return case, result and legend as points of interest with a text."""
-    lines = [case_line(outcome.case, outcome.index), told.result]
+    case = outcome.case
+    named = f"case {outcome.index}, POV level {level_name(case.level)}: {described(case)}"
     root = etree.Element("additional")
     # Lines from the top of the view downwards, and the legend in a row below them.
-    for number, line in enumerate(lines):
+    for number, line in enumerate((named, told.result)):
         at = view.place(0.0, FIRST_LINE_UP - LINE_DOWN * number)
         _label(root, f"line{number}", at, line)
-    cars = VEHICLES[: outcome.case.scenario.vehicles]
+    cars = VEHICLES[: case.scenario.vehicles]
     for number, name in enumerate((*cars, UNIT)):
         at = view.place(LEGEND_RIGHT * (number - 0.5 * len(cars)), LEGEND_UP)
         colour = COLOURS.get(name, PALE)
         _label(root, name, at, LEGEND[name], colour, DOT * view.width_m)
     return root
-
-
-def case_line(case: Case, index: int | None) -> str:
-    """Return index, level and coordinates of a case in one line.
-
-    Args:
-        case: the case.
-        index: index in its campaign; None for a single case.
-    """
-    named = "" if index is None else f"case {index}, "
-    return f"{named}POV level {level_name(case.level)}: {described(case)}"
 
 
 def _label(

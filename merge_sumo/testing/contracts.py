@@ -23,7 +23,7 @@ from merge_sumo.campaigns.recorded import RecordedCampaign
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.controllers.kinds import load
 from merge_sumo.files import ScratchFolder
-from merge_sumo.metrics.measures import Measure, Measures
+from merge_sumo.metrics.measures import Measure, measures_of
 from merge_sumo.road.scenario_file import named_scenario
 from merge_sumo.samplers.contract import SamplerContract, play, play_case
 from merge_sumo.scenario.case import Case, Pool
@@ -71,10 +71,8 @@ class MeasureContract:
     def values(self) -> list[float | None]:
         """Return the values of some episodes."""
         points = np.random.default_rng(0).random((10, 2))
-        values = []
-        for case in self.pool.cases(points, self.pool.levels[0]):
-            values.append(self.measure.function(Measures(episode(case))))
-        return values
+        episodes = map(episode, self.pool.cases(points, self.pool.levels[0]))
+        return list(map(self.measure.function, measures_of(list(episodes), None)))
 
     def test_says_what_it_is(self) -> None:
         assert self.measure.name.isidentifier()
@@ -94,7 +92,7 @@ class MeasureContract:
         (case,) = self.pool.cases(np.full((1, 2), 0.5), self.pool.levels[0])
         trajectory = episode(case)
         before = trajectory.motion.copy()
-        self.measure.function(Measures(trajectory))
+        self.measure.function(*measures_of([trajectory], None))
         assert np.array_equal(before, trajectory.motion)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from merge_sumo.campaigns.settings import CampaignSettings
 from merge_sumo.drivers.policies import load_network
-from merge_sumo.metrics.paper import is_close
+from merge_sumo.metrics.measures import Measures
 from merge_sumo.scenario.case import Case, from_unit
 from merge_sumo.scenario.scenario import SVO, Scenario
 from merge_sumo.scenario.trajectory import End, Trajectory
@@ -125,7 +125,7 @@ def check_policy(
     without = _play(cases, name, "level0", folder)
     reached = returns_of(trajectories, reward).of(game.role, svo_rad)
     level0 = returns_of(without, reward).of(game.role, svo_rad)
-    collided = np.array([is_close(one) for one in trajectories])
+    collided = np.array([Measures(one).is_close for one in trajectories])
     start = np.array([np.ravel(case.starts()) for case in cases])
     if game.opponent is None:
         best = best_response(game, start, reached)

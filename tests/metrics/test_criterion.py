@@ -50,7 +50,7 @@ def margin(text, **values):
 
 def of(expression, trajectory):
     """Return the margin of an episode under a criterion."""
-    return Criterion(expression).margin(trajectory, Measures.of(trajectory))
+    return Criterion(expression).margin(Measures.of(trajectory))
 
 
 def nearest(trajectory, lines):

@@ -54,7 +54,7 @@ class TestMeasures:
         assert (measures.after_gap_m, measures.after_ttc_s) == (-0.5, 0.0)
         assert measures.after_drac_mps2 is None
         for met in ("after_drac_mps2 > 99", "after_ttc_s < 0.1", "contact", "unsafe"):
-            assert Criterion(met).margin(episode, measures) < 0.0, met
+            assert Criterion(met).margin(measures) < 0.0, met
 
     def test_need_a_follow_up(self):
         with pytest.raises(UserError, match="`follow_up_s` above 0"):
