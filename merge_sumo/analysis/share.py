@@ -107,9 +107,7 @@ def own_shares(run: RecordedCampaign) -> list[LevelShare]:
     return shares
 
 
-def write_shares(
-    study: RunStudy, on_part: Callable[[int, int], None] = lambda _done, _total: None
-) -> None:
+def write_shares(study: RunStudy, on_part: Callable[[int, int], None]) -> None:
     """Measure the share that fails at each level of a campaign that has just ended, and write it.
 
     The cases of a campaign that drew them uniformly are counted where further ones take long or

@@ -21,7 +21,6 @@ from merge_sumo.controllers.spec import ControllerOptions
 from merge_sumo.drivers.policies import policies_name
 from merge_sumo.errors import UserError
 from merge_sumo.metrics.criterion import Criterion
-from merge_sumo.metrics.summary import check_tolerated
 from merge_sumo.printable import printable
 from merge_sumo.records import RecordError, check_fields, to_plain
 from merge_sumo.road.loader import road_for
@@ -83,7 +82,11 @@ class CampaignSettings(SharedSettings):
         # Both raise for wrong values.
         self._controller_options(None)
         self.new_sampler()
-        check_tolerated(self.tolerated)
+        if not 0.0 <= self.tolerated < 1.0:
+            raise UserError(
+                f"`tolerated` is {self.tolerated}: choose the share of its runs in which a case "
+                "may fail, from 0 to below 1, say 0.1"
+            )
         if self.seed < 0:
             raise UserError(f"`seed` is {self.seed}: it must be 0 or more")
         for name in ("cases", "batch", "in_flight", "repeat"):

@@ -108,8 +108,7 @@ class _Parser:
                 return self.condition(ast.parse(self._named[name], mode="eval").body)
             case ast.Name(id=name) if name not in self._vocabulary:
                 raise self._unknown(name)
-        shown = printable(ast.unparse(node)[:60])
-        raise self._error(f"{shown} is not a condition: write comparisons, and, or, not, brackets")
+        raise self._error("is not a condition: write comparisons, and, or, not, brackets", node)
 
     def _comparison(self, first: ast.expr, sign: ast.cmpop, second: ast.expr) -> Condition:
         left, right = self._side(first), self._side(second)
@@ -156,16 +155,16 @@ class _Parser:
                 number = self._side(constant)
                 if isinstance(number, float):
                     return -number
-        shown = printable(ast.unparse(node)[:60])
-        raise self._error(f"{shown} is neither a measure nor a number nor a text")
+        raise self._error("is neither a measure nor a number nor a text", node)
 
     def _unknown(self, name: str) -> UserError:
         known = *self._vocabulary, *self._named
         hint = meant(name, known) or f"choose {', '.join(known)}"
         return self._error(f"no measure {printable(name)!r} (a text is in quotes): {hint.strip()}")
 
-    def _error(self, why: str) -> UserError:
-        return UserError(f"{self._what}: {why}")
+    def _error(self, why: str, node: ast.expr | None = None) -> UserError:
+        shown = printable(ast.unparse(node)[:60]) + " " if node else ""
+        return UserError(f"{self._what}: {shown}{why}")
 
 
 def _inequality(left: str | float, right: str | float, *, or_equal: bool) -> Condition:

@@ -42,8 +42,8 @@ from merge_sumo.metrics.merge import (
     STANDS_MPS,
     Severity,
     brake_after_mps2,
+    gaps_at_m,
     last_avoidable_s,
-    neighbours,
     place_of_merge_m,
 )
 from merge_sumo.metrics.paper import FAILURE_SCORE, merge_score, time_to_collision
@@ -310,7 +310,7 @@ class Measures:
         From the front bumper of the car behind to the rear bumper of the car ahead, negative where
         bodies overlap; None without a merge.
         """
-        return min((car.gap_m for car in neighbours(self.trajectory)), default=None)
+        return float(gaps_at_m(self.trajectory)[0].min(initial=math.inf))
 
     @measure(worse="low", label="smallest gap from M on, or overlap", column="clearance")
     def clearance_m(self) -> float | None:
@@ -542,12 +542,15 @@ class Measures:
 
     def _lane_gap(self, *, is_ahead: bool) -> tuple[float | None, float | None]:
         """Return the gap to the next car at a merge from a lane, in m and in s."""
-        cars = [car for car in neighbours(self.trajectory) if car.is_ahead == is_ahead]
-        if self.x_merge_m is None or not cars:
+        if self.x_merge_m is None:
             return None, None
-        nearest = min(cars)
-        v_mps = float(self.trajectory.v_vut_mps[-1]) if is_ahead else nearest.v_mps
-        return nearest.gap_m, nearest.gap_m / v_mps if v_mps > 0.0 else None
+        x_m, v_mps, _ = np.delete(self.trajectory.motion[-1], VUT, axis=0).T
+        gaps, _ = gaps_at_m(self.trajectory)
+        gaps[(x_m >= self.x_merge_m) != is_ahead] = math.inf
+        nearest = gaps.argmin()
+        v_rear_mps = self.trajectory.v_vut_mps[-1] if is_ahead else v_mps[nearest]
+        gap_m = float(gaps[nearest])
+        return gap_m, gap_m / float(v_rear_mps) if v_rear_mps > 0.0 else None
 
     @measure(
         worse="high",

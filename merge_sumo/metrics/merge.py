@@ -23,6 +23,7 @@ from merge_sumo.metrics.bodies import (
     one_lane_row,
     times_to_collision_s,
 )
+from merge_sumo.scenario.case import FloatArray
 from merge_sumo.scenario.scenario import DT_S, VUT, Scenario
 from merge_sumo.scenario.trajectory import End, Trajectory
 
@@ -36,36 +37,15 @@ HARSH_MPS2 = 3.0
 No. 79, 5.6.4.7."""
 
 
-class Neighbour(NamedTuple):
-    """A car of the mainline at M.
-
-    Attributes:
-        is_ahead: whether it is ahead of the VUT.
-        gap_m: bumper gap, negative where bodies overlap.
-        v_mps: its speed.
-        closing_mps: closing speed, negative where the gap opens.
-    """
-
-    is_ahead: bool
-    gap_m: float
-    v_mps: float
-    closing_mps: float
-
-
-def neighbours(trajectory: Trajectory) -> list[Neighbour]:
-    """Return the cars of the mainline at M; none where the VUT did not merge.
+def gaps_at_m(trajectory: Trajectory) -> tuple[FloatArray, FloatArray]:
+    """Return bumper gaps and closing speeds (`gaps_m`) at M; none where the VUT did not merge.
 
     Args:
         trajectory: the motion.
     """
-    if trajectory.end is not End.MERGED:
-        return []
-    at_m = trajectory.motion[-1:]
-    x_m, v_mps, _ = np.delete(at_m[0], VUT, axis=0).T
-    (gap_m,), (closing_mps,) = gaps_m(at_m, trajectory.case.scenario.lengths_m)
-    is_ahead = x_m >= at_m[0, VUT, 0]
-    columns = (is_ahead.tolist(), gap_m.tolist(), v_mps.tolist(), closing_mps.tolist())
-    return list(map(Neighbour, *columns))
+    at_m = trajectory.motion[-1:] if trajectory.end is End.MERGED else trajectory.motion[:0]
+    gap_m, closing_mps = gaps_m(at_m, trajectory.case.scenario.lengths_m)
+    return gap_m.ravel(), closing_mps.ravel()
 
 
 def place_of_merge_m(trajectory: Trajectory) -> float:
@@ -102,13 +82,12 @@ def brake_after_mps2(trajectory: Trajectory) -> float:
         0 where no vehicle has to brake; infinite where bodies overlap or no
         braking is in time.
     """
-    needed_mps2 = [0.0]
-    for car in neighbours(trajectory):
-        room_m = car.gap_m - max(car.closing_mps, 0.0) * REACTION_S
-        if room_m <= 0.0:
-            return math.inf
-        needed_mps2.append(max(car.closing_mps, 0.0) ** 2 / (2.0 * room_m))
-    return max(needed_mps2)
+    gap_m, closing_mps = gaps_at_m(trajectory)
+    closing_mps = np.maximum(closing_mps, 0.0)
+    room_m = gap_m - closing_mps * REACTION_S
+    if (room_m <= 0.0).any():
+        return math.inf
+    return float((np.square(closing_mps) / (2.0 * room_m)).max(initial=0.0))
 
 
 class Severity(StrEnum):

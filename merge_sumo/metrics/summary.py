@@ -177,22 +177,6 @@ def is_decided(failures: int, runs: int, tolerated: float) -> bool:
     return float(betainc(failures - 0.5, runs - failures + 0.5, tolerated)) <= DOUBT
 
 
-def check_tolerated(tolerated: float) -> None:
-    """Check a tolerated share of failing runs.
-
-    Args:
-        tolerated: the share.
-
-    Raises:
-        UserError: it is not from 0 to below 1.
-    """
-    if not 0.0 <= tolerated < 1.0:
-        raise UserError(
-            f"`tolerated` is {tolerated}: choose the share of its runs in which a case may fail, "
-            "from 0 to below 1, say 0.1"
-        )
-
-
 def clopper_pearson(failures: int, cases: int, confidence: float) -> tuple[float, float]:
     """Return the exact interval of a probability by independent cases; (0, 1) without any.
 

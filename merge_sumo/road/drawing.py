@@ -12,6 +12,7 @@ import numpy as np
 from lxml import etree
 
 from merge_sumo.road.road import LanePath, Road
+from merge_sumo.road.xml_input import to_bytes
 from merge_sumo.scenario.scenario import COLOURS, Scenario
 
 NAMESPACE = "http://www.w3.org/2000/svg"
@@ -77,7 +78,7 @@ def road_svg(road: Road, scenario: Scenario) -> bytes:
         etree.SubElement(root, "circle", place, r="3", fill=colour)
         place = {"x": f"{at.x_m + 4.0:.1f}", "y": f"{-at.y_m - 4.0:.1f}", "font-size": "9"}
         etree.SubElement(root, "text", place).text = name
-    return etree.tostring(root, xml_declaration=True, encoding="UTF-8", pretty_print=True)
+    return to_bytes(root)
 
 
 def _part(path: LanePath, low_m: float, high_m: float) -> Line:

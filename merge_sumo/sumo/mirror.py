@@ -294,4 +294,4 @@ def _types(road: Road, scenario: Scenario) -> bytes:
             decel=repr(-scenario.a_min_mps2),
             emergencyDecel=repr(-scenario.a_min_mps2),
         )
-    return etree.tostring(root, xml_declaration=True, encoding="UTF-8")
+    return to_bytes(root)

@@ -33,6 +33,7 @@ from numpy.typing import NDArray
 from merge_sumo.errors import UserError
 from merge_sumo.road.loader import road_of
 from merge_sumo.road.road import Road
+from merge_sumo.road.xml_input import to_bytes
 from merge_sumo.scenario.case import FloatArray
 from merge_sumo.scenario.scenario import DT_S, POV, VEHICLES, VUT, Scenario
 from merge_sumo.sumo.binding import (
@@ -361,7 +362,7 @@ def _types(
     """Return the additional file with the vTypes."""
     root = etree.Element("additional")
     for row, own_type in ((POV, car_type), (VUT, vut_type)):
-        length_m = repr(scenario.vut_length_m if row == VUT else scenario.pov_length_m)
+        length_m = repr(scenario.lengths_m[row == VUT])
         told = {"id": _type_id(row, by_sumo=False), "minGap": "0", "maxSpeed": repr(MAX_SPEED_MPS)}
         etree.SubElement(root, "vType", told, length=length_m)
         if own_type is not None:
@@ -375,7 +376,7 @@ def _types(
                 "emergencyDecel": repr(-scenario.a_min_mps2),
             }
             etree.SubElement(root, "vType", {**careful, **own_type})
-    return etree.tostring(root, xml_declaration=True, encoding="UTF-8")
+    return to_bytes(root)
 
 
 @contextmanager
