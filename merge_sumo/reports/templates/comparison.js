@@ -4,7 +4,7 @@ const rows = buttons.map((button) => button.closest("tr"));
 const figures = [...document.querySelectorAll(".view")], sides = [...document.querySelectorAll(".side")];
 
 function show(n) { // cases 2 n and 2 n + 1 are those of the earlier and the later version
-  byId("case-title").textContent = rows[n].dataset.title;
+  byId("case-title").textContent = signed(rows[n].dataset.title);
   for (const [k, side] of sides.entries()) {
     const i = 2 * n + k, replay = side.querySelector("code");
     side.querySelector("b").textContent = `${cases.version[i]}: ${cases.result[i]}`;

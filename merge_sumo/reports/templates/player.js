@@ -19,7 +19,10 @@ function draw(parent, tag, attributes = {}, text = null) {
 }
 const clamp = (value, low, high) => Math.min(Math.max(value, low), high);
 const fixed = (value, digits) => value.toFixed(digits).replace("-", "\u2212");
-const signed = (text) => text.replace(/(^|[\s(])-(?=[\d.])/g, "$1\u2212");
+const signed = (text) => text.replace(/(^|[\s(])-(?=[\d.])/g, "$1\u2212").replace(/m\/s2\b/g, "m/s\u00b2");
+// Numbers of the page as those of maps and charts; what others wrote, and what may be copied into a shell, stays.
+const texts = document.createTreeWalker(document.body, NodeFilter.SHOW_TEXT);
+while (texts.nextNode()) if (!texts.currentNode.parentElement.closest("script, code, pre, .message, .note, .settings, .untested, h1, option")) texts.currentNode.data = signed(texts.currentNode.data);
 const bytes = (text) => Uint8Array.from(atob(text), (c) => c.charCodeAt(0));
 const path = (points) => points.map(([x, y], i) => `${i ? "L" : "M"}${x.toFixed(2)} ${y.toFixed(2)}`).join("");
 

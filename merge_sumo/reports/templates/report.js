@@ -562,10 +562,6 @@ function search() {
   plot(byId("chart-fmc"), { xRange: [0, numbers[numbers.length - 1]], xLabel: "cases", yRange: [0, 1.1 * most], lines });
 }
 
-// Numbers of the page as those of maps and charts; what others wrote, and what may be copied into a shell, stays.
-const texts = document.createTreeWalker(document.body, NodeFilter.SHOW_TEXT);
-while (texts.nextNode()) if (!texts.currentNode.parentElement.closest("script, code, pre, .message, .note, .settings, .untested, h1, option")) texts.currentNode.data = signed(texts.currentNode.data);
-
 const filter = allCases();
 restore();
 for (const map of maps) map.showAll();
