@@ -79,7 +79,7 @@ from merge_sumo.reports import figures
 from merge_sumo.reports.cases_toml import with_file
 from merge_sumo.reports.comparison_page import PAGE, comparison_page
 from merge_sumo.reports.exports import export_cases
-from merge_sumo.reports.junit import JUNIT, check_junit, write_junit, write_junit_of_comparison
+from merge_sumo.reports.junit import JUNIT, write_junit, write_junit_of_comparison
 from merge_sumo.reports.progress import Bars, CampaignBars
 from merge_sumo.reports.report import RunningReport, check_report, write_report
 from merge_sumo.result import Shown
@@ -392,7 +392,8 @@ def benchmark(config: c.Benchmark) -> sampler_study.SamplerStudy:
     """Compare samplers with each other and with the ground truth."""
     picture = path_of(config.figure)
     if picture is not None:
-        figures.check_figure(picture)
+        check_new(picture, "`figure`", figures.KINDS)
+        figures.require("matplotlib")
     names = sampler_study.names_of(config)
     settings = settings_from_config(
         config, sampler=names[0], cases=config.cases, batch=config.batch
@@ -597,7 +598,7 @@ def run_and_report(
     junit = path_of(config.junit)
     parse_gates(config.gates, against=settings.against is not None)
     if junit is not None:
-        check_junit(junit)
+        check_new(junit, "`junit`", JUNIT)
     bars = CampaignBars(folder, settings.cases, settings.tolerated, shown=config.progress)
     title = f"{settings.vut} v level {'/'.join(map(level_name, settings.levels))}"
 

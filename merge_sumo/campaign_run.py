@@ -16,7 +16,7 @@ from merge_sumo.config import AnyRun
 from merge_sumo.errors import UserError
 from merge_sumo.metrics.measures import Measures
 from merge_sumo.metrics.outcome import Episode, Outcome
-from merge_sumo.metrics.plausibility import doubts, in_vain
+from merge_sumo.metrics.plausibility import in_vain
 from merge_sumo.metrics.summary import (
     GateResult,
     Summary,
@@ -29,7 +29,7 @@ from merge_sumo.reports.campaign_table import campaign_lines, labelled
 from merge_sumo.reports.comparison_page import AGAINST_PAGE
 from merge_sumo.reports.facts import Fact, facts_of
 from merge_sumo.reports.figures import draw_case, draw_map, maps_picture, require
-from merge_sumo.reports.text import comparison_summary, episode_lines, timelines
+from merge_sumo.reports.text import comparison_summary, episode_lines, notes_of, timelines
 from merge_sumo.result import Result
 from merge_sumo.road.loader import centre_lines, road_for
 from merge_sumo.road.scenario_file import SUFFIX
@@ -221,10 +221,6 @@ class CampaignRun(Result):
 
         return write_report(self.recorded)
 
-    @property
-    def _doubts(self) -> list[str]:
-        return doubts(self.recorded.cases, self.recorded.settings.in_vain)
-
     def to_record(self) -> dict[str, Any]:
         """Return the object that `merge-sumo campaign --json` prints.
 
@@ -233,7 +229,7 @@ class CampaignRun(Result):
         index of the failure with the lowest margin.
         """
         shares, worst = SHARES.read(self.folder), failures(self.recorded.cases)
-        return {
+        record = {
             **self.summary.to_record(),
             "worst_case": worst[0].index if worst else None,
             "shares": [] if shares is None else to_plain(shares.levels),
@@ -241,26 +237,23 @@ class CampaignRun(Result):
             "passed": self.passed,
             "stopped": "converged" if self.converged else "cases",
             "fail_when": self.recorded.criterion.as_written,
-            "notes": self._doubts,
-            **(
-                {}
-                if self.against is None
-                else {AGAINST: self.against.version_changes[0].to_record()}
-            ),
+            "notes": notes_of(self.recorded),
             "repeats": to_plain(self.repeats),
             "run": str(self.folder),
             "report": str(self.report_file),
         }
+        if self.against is not None:
+            record[AGAINST] = self.against.version_changes[0].to_record()
+        return record
 
     def lines(self) -> list[str]:
         """Return the table of POV levels, remarks, and the path of the report."""
         run, warning = self.recorded, unrepeatable(self.repeats)
-        notes = [run.ran_again_in_words] if run.settings.ran_again else []
         return [
             *([] if warning is None else [warning]),
             *self._against_lines(),
             *campaign_lines(run, self.summary, self.facts),
-            *labelled("Note:", [*notes, *self._doubts]),
+            *labelled("Note:", notes_of(run)),
             *labelled("Report:", [str(self.report_file)]),
         ]
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 from merge_sumo.analysis.comparison import (
@@ -15,7 +13,6 @@ from merge_sumo.analysis.comparison import (
 )
 from merge_sumo.campaigns.printed_commands import command
 from merge_sumo.campaigns.recorded import AGAINST
-from merge_sumo.files import GENERATOR, replace_own
 from merge_sumo.metrics.timeline import timeline
 from merge_sumo.reports.pages import page
 from merge_sumo.reports.report_data import columns, motion_row, packed, player_data
@@ -29,20 +26,7 @@ PAGE = ".html"
 """Ending of a page; a browser shows a file with another ending as source."""
 AGAINST_PAGE = f"{AGAINST}{PAGE}"
 """Page in the folder of a campaign against an earlier version."""
-
-
-def write_against(folder: Path, compared: Comparison) -> None:
-    """Write the page of a campaign against an earlier version, in place of an older one.
-
-    Args:
-        folder: folder of the campaign.
-        compared: the comparison with the earlier version.
-
-    Raises:
-        UserError: it cannot be written, or merge-sumo did not create the file in its place.
-    """
-    content = comparison_page(compared).encode(errors="backslashreplace")
-    replace_own(folder / AGAINST_PAGE, content, GENERATOR)
+ShownCases = list[tuple[VersionChange, ComparedCase]]
 
 
 def comparison_page(compared: Comparison) -> str:
@@ -51,7 +35,7 @@ def comparison_page(compared: Comparison) -> str:
     Args:
         compared: the comparison.
     """
-    shown: list[tuple[VersionChange, ComparedCase]] = []
+    shown: ShownCases = []
     lists = []
     for version_change in compared.version_changes:
         for change in Change:
@@ -78,7 +62,7 @@ def comparison_page(compared: Comparison) -> str:
     )
 
 
-def _maps(shown: Sequence[tuple[VersionChange, ComparedCase]]) -> dict[tuple[int, int], Any]:
+def _maps(shown: ShownCases) -> dict[tuple[int, int], Any]:
     """Return by version and level the coordinates, and the marks, the first ones on top."""
     maps: dict[tuple[int, int], Any] = {}
     for number, (version_change, one) in reversed(list(enumerate(shown))):
@@ -89,9 +73,7 @@ def _maps(shown: Sequence[tuple[VersionChange, ComparedCase]]) -> dict[tuple[int
     return dict(sorted(maps.items()))
 
 
-def _data(
-    compared: Comparison, shown: Sequence[tuple[VersionChange, ComparedCase]]
-) -> dict[str, Any]:
+def _data(compared: Comparison, shown: ShownCases) -> dict[str, Any]:
     """Return what the scripts draw: two entries of `cases` for each case shown."""
     scenario = shown[0][1].later.case.scenario
     road = road_or_shipped(scenario)

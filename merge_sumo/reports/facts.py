@@ -41,10 +41,7 @@ TIMEOUTS = "timeouts"
 FAILURES = "failures"
 UNDECIDED = "undecided"
 CONTACT = "cases with contact that are not failures"
-REGIONS = "regions"
-FMC = "FMC"
 STARTS_THAT_FAIL = "starts that fail"
-STARTS = "uniform starts simulated"
 REPEATED = "cases that ran more than once"
 DRIVEN = "failures that reference drivers drove"
 AVOIDED = "failures that driver {} avoids"
@@ -139,7 +136,7 @@ def _shares(run: RecordedCampaign) -> Facts:
         if one.without_verdict < one.cases:
             fact = partial(Fact, file=SHARES.name, level=one.level)
             yield fact(STARTS_THAT_FAIL, one.shown, "levels: failures of cases")
-            yield fact(STARTS, one.cases, "levels: cases")
+            yield fact("uniform starts simulated", one.cases, "levels: cases")
             if one.without_verdict:
                 name = "uniform starts without a verdict"
                 yield fact(name, one.without_verdict, "levels: without_verdict")
@@ -172,9 +169,9 @@ def _of_level(run: RecordedCampaign, level: int, summary: LevelSummary, failing:
         yield fact(FAILURES, summary.failures, failing)
         if run.tolerated:
             yield fact(UNDECIDED, summary.undecided, "draw")
-        yield fact(REGIONS, summary.regions, f"{failing}: starts")
+        yield fact("regions", summary.regions, f"{failing}: starts")
         radius = radius_for(len(run.scenario.dimensions(level)))
-        yield fact(FMC, summary.fmc, f"{failing}: starts within {radius:.2g}")
+        yield fact("FMC", summary.fmc, f"{failing}: starts within {radius:.2g}")
     if run.scenario.lane_m is None:
         return
     at_level = [outcome for outcome in run.cases if outcome.case.level == level]

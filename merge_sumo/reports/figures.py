@@ -26,7 +26,7 @@ from merge_sumo.analysis.reproduction import (
 )
 from merge_sumo.analysis.sampler_study import SamplerStudy
 from merge_sumo.errors import UserError
-from merge_sumo.files import check_new, write_new
+from merge_sumo.files import write_new
 from merge_sumo.metrics.fmc import RADIUS
 from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.metrics.timeline import Timeline
@@ -70,6 +70,7 @@ VERDICT_COLOURS = {
 }
 """Colours of verdicts, as in the report; marks of the last ones lie on top."""
 KINDS = (".png", ".svg")
+"""Endings of figures."""
 STYLE: Any = {
     "axes.titlelocation": "left",
     "axes.spines.top": False,
@@ -80,19 +81,6 @@ STYLE: Any = {
     "svg.fonttype": "path",
     "mathtext.default": "regular",
 }
-
-
-def check_figure(path: Path) -> None:
-    """Check that a figure can be drawn later.
-
-    Args:
-        path: its new file.
-
-    Raises:
-        UserError: the file exists, has another ending, or matplotlib is not installed.
-    """
-    check_new(path, "`figure`", KINDS)
-    require("matplotlib")
 
 
 def require(library: str, extra: str = "plot") -> Any:

@@ -9,7 +9,7 @@ from pathlib import Path
 from merge_sumo.analysis.comparison import Change, Comparison, VersionChange
 from merge_sumo.campaign_run import CampaignRun
 from merge_sumo.campaigns.recorded import NAME_CHARACTERS, RecordedCampaign
-from merge_sumo.files import check_new, write_new
+from merge_sumo.files import write_new
 from merge_sumo.metrics.summary import by_case
 from merge_sumo.printable import printable
 from merge_sumo.reports.facts import Fact
@@ -43,18 +43,6 @@ class TestCase:
     tag: str = ""
     kind: str = ""
     message: str = ""
-
-
-def check_junit(path: Path) -> None:
-    """Check that a campaign can write this JUnit file later.
-
-    Args:
-        path: the file.
-
-    Raises:
-        UserError: it exists, or its name has another ending.
-    """
-    check_new(path, "`junit`", JUNIT)
 
 
 def write_junit(path: Path, result: CampaignRun) -> None:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from markupsafe import Markup
 
+from merge_sumo.files import GENERATOR, replace_own
 from merge_sumo.printable import counted, printable, quoted, sentence
 from merge_sumo.scenario.case import described
 from merge_sumo.scenario.scenario import level_name
@@ -45,6 +46,19 @@ def page(
         own[name] = Markup(source)  # noqa: S704 (our own files)
         own[f"{name}_hash"] = Markup(f"sha256-{digest}")  # noqa: S704 (by this a policy names it)
     return environment().get_template(template).render({**own, **words})
+
+
+def replace_page(path: Path, html: str) -> None:
+    """Write a page in the place of an older one.
+
+    Args:
+        path: file of the page.
+        html: the page.
+
+    Raises:
+        UserError: it cannot be written, or merge-sumo did not create the file in its place.
+    """
+    replace_own(path, html.encode(errors="backslashreplace"), GENERATOR)
 
 
 def source_of(name: str) -> str:

@@ -25,18 +25,17 @@ from merge_sumo.campaigns.repeatability import read_second_runs, unrepeatable
 from merge_sumo.controllers.process import LOG, end_of
 from merge_sumo.drivers.reference_drivers import REFERENCE_DRIVERS
 from merge_sumo.errors import UserError
-from merge_sumo.files import GENERATOR, check_generated, replace_own
+from merge_sumo.files import check_generated
 from merge_sumo.metrics.fmc import radius_for
 from merge_sumo.metrics.merge import meanings
 from merge_sumo.metrics.outcome import Outcome
-from merge_sumo.metrics.plausibility import doubts
 from merge_sumo.metrics.timeline import KINDS
 from merge_sumo.reports import facts
-from merge_sumo.reports.comparison_page import AGAINST_PAGE, write_against
-from merge_sumo.reports.pages import page
-from merge_sumo.reports.report_data import page_data, pairs_of
+from merge_sumo.reports.comparison_page import AGAINST_PAGE, comparison_page
+from merge_sumo.reports.pages import page, replace_page
+from merge_sumo.reports.report_data import page_data
 from merge_sumo.reports.report_model import INDEX, ReportModel
-from merge_sumo.reports.text import robustness
+from merge_sumo.reports.text import notes_of, robustness
 
 REPORT = "report.html"
 FIRST_REPORT_S = 2.0
@@ -62,9 +61,9 @@ def write_report(run: RecordedCampaign) -> Path:
         UserError: it cannot be written, or merge-sumo did not create the file in its place.
     """
     model = ReportModel(run)
-    _replace(run, report_page(model))
+    replace_page(run.folder / REPORT, report_page(model))
     if model.against is not None:
-        write_against(run.folder, model.against)
+        replace_page(run.folder / AGAINST_PAGE, comparison_page(model.against))
     return run.folder / REPORT
 
 
@@ -79,9 +78,6 @@ def report_page(model: ReportModel, *, running: bool = False) -> str:
         >>> html = report_page(ReportModel(ms.open_run("runs/latest").recorded, learns=False))
     """
     run = model.run
-    notes = doubts(run.cases, run.settings.in_vain)
-    if run.settings.ran_again:
-        notes.append(run.ran_again_in_words)
     # No "<" in the JSON: nothing in it can end its element.
     data = msgspec.json.encode(page_data(model)).decode().replace("<", "\\u003c")
     return page(
@@ -95,7 +91,7 @@ def report_page(model: ReportModel, *, running: bool = False) -> str:
         # Of this campaign.
         model=model,
         warning=unrepeatable(read_second_runs(run)),
-        notes=notes,
+        notes=notes_of(run),
         go_on=campaign_command("resume", run.folder, run.record),
         printed=end_of(run.folder / LOG),
         of={fact.name: fact for fact in model.facts if fact.level is None},
@@ -108,7 +104,6 @@ def report_page(model: ReportModel, *, running: bool = False) -> str:
         # Functions that the sections call.
         meanings=meanings,
         robustness=robustness,
-        pairs_of=pairs_of,
         radius_for=radius_for,
         log10=math.log10,
     )
@@ -125,10 +120,6 @@ def check_report(folder: Path) -> None:
     """
     check_generated(folder / REPORT)
     check_generated(folder / AGAINST_PAGE)
-
-
-def _replace(run: RecordedCampaign, html: str) -> None:
-    replace_own(run.folder / REPORT, html.encode(errors="backslashreplace"), GENERATOR)
 
 
 class RunningReport:
@@ -179,7 +170,8 @@ class RunningReport:
         """Write the report of the cases so far; return whether that was possible."""
         try:
             run = RecordedCampaign(self._folder)
-            _replace(run, report_page(ReportModel(run, learns=False), running=running))
+            html = report_page(ReportModel(run, learns=False), running=running)
+            replace_page(self._folder / REPORT, html)
         except UserError:
             return False
         return True

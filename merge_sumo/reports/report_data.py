@@ -22,7 +22,7 @@ from merge_sumo.printable import printable
 from merge_sumo.records import to_plain
 from merge_sumo.reports.pages import ERROR_CHARACTERS
 from merge_sumo.reports.report_model import ReportModel
-from merge_sumo.reports.text import changes, name_and_unit
+from merge_sumo.reports.text import axes_of, changes
 from merge_sumo.road.drawing import road_data
 from merge_sumo.road.loader import centre_lines
 from merge_sumo.road.road import Road
@@ -37,9 +37,6 @@ COUNT_GRID = (32, 20)
 """Cells of a map, across and up, in which further cases are counted."""
 GRID: dict[int, Grid] = {2: (49, 49, 1), 3: (33, 33, 9)}
 """Nodes of the surrogate by number of coordinates; a map moves through the third one."""
-
-Axes = tuple[int, int]
-"""Indices of two coordinates in the pool's order."""
 
 
 def page_data(model: ReportModel) -> dict[str, Any]:
@@ -57,12 +54,11 @@ def page_data(model: ReportModel) -> dict[str, Any]:
     measures = []
     for name, measure in recorded_measures(scenario).items():
         if measure.column:
-            unit = measure.unit.replace("s2", "s²")
-            title = f"{scenario.wording(measure.column)} {unit}".rstrip()
-            measures.append({"name": name, "title": title, "digits": measure.digits})
+            title = scenario.wording(measure.column)
+            shown = {"name": name, "title": title, "unit": measure.unit, "digits": measure.digits}
+            measures.append(shown)
     return {
         "varies": model.varies,
-        "place": "M" if scenario.lane_m is None else scenario.place,
         "level_names": {level: level_name(level) for level in ALL_LEVELS},
         "coordinates": model.coordinates,
         "severities": list(Severity),
@@ -146,16 +142,13 @@ def _row(model: ReportModel, outcome: Outcome) -> dict[str, Any]:
         "region": model.regions.get(index),
         "kind": told.kind,
         "undecided": index in model.summary.undecided_cases,
+        "avoidance": model.avoidance.get(index),
     }
     for coordinate in model.coordinates:
         row[coordinate.field] = _rounded(coordinate.of(outcome.case), coordinate.digits + 2)
     for name, measure in recorded_measures(outcome.case.scenario).items():
         if measure.column:
             row[name] = _rounded(measures.value(name), 4)
-    if model.avoidance:
-        avoidance = model.avoidance.get(index)
-        row["avoided_by"] = avoidance and avoidance.avoided_by
-        row["pov_careful"] = avoidance and avoidance.pov_careful
     if model.repeated:
         row["runs"] = None
         if runs := model.repeated.get(index):
@@ -173,13 +166,10 @@ def _explanations(model: ReportModel) -> dict[int, dict[str, Any]]:
         case = model.run.outcome(known.index).case
         of_case = found.setdefault(known.index, {"words": [], "axes": []})
         # Of another VUT in the same case.
-        prefix = "" if known.vut is None else f"{printable(known.vut)}: "
+        prefix = "" if known.vut is None else f"with {printable(known.vut)}: "
         for words in changes(known, case):
-            of_case["words"].append(f"with {prefix}{words}" if prefix else words)
-        for axis in (*known.start, *known.parameters):
-            name, unit = f"vut: {axis.name}", ""
-            if axis in known.start:
-                name, unit = name_and_unit(case, axis.name)
+            of_case["words"].append(prefix + words)
+        for axis, name, unit in axes_of(known, case):
             of_case["axes"].append(to_plain(axis) | {"name": prefix + name, "unit": unit})
     return found
 
@@ -215,15 +205,6 @@ def packed(motions: Iterable[Trajectory]) -> str:
     return base64.b64encode(content).decode()
 
 
-def pairs_of(dims: int) -> list[Axes]:
-    """Return the pairs of coordinates of a level that a map may show, the first one first.
-
-    Args:
-        dims: number of coordinates of the level.
-    """
-    return [(0, 1)] if dims <= 3 else list(combinations(range(dims), 2))
-
-
 def _map(model: ReportModel, level: int) -> dict[str, Any]:
     """Return the map of a level: its cases that are counted, and the failure probability.
 
@@ -232,19 +213,20 @@ def _map(model: ReportModel, level: int) -> dict[str, Any]:
     """
     dims, surface = len(model.axes[level]), model.surfaces[level]
     probability = _probability(surface, GRID[dims]) if surface and dims in GRID else None
-    shown = {outcome.index for outcome in model.shown}
-    others = [o for o in model.run.cases if o.case.level == level and o.index not in shown]
+    others = [
+        o for o in model.run.cases if o.case.level == level and o.index not in model.timelines
+    ]
     points = to_unit((outcome.case for outcome in others), level, model.run.scenario)
     failed = np.array([outcome.failed for outcome in others], dtype=bool)
+    pairs = [(0, 1)] if dims <= 3 else list(combinations(range(dims), 2))
     counts = []
-    for axes in pairs_of(dims) if others else ():
+    for axes in pairs if others else ():
         places = points[:, axes]
         counts.append([_counts(places[~failed]), _counts(places[failed])])
     return {
-        "pairs": pairs_of(dims),
-        "through": 2 if dims == 3 else None,
-        # In more coordinates a ball is as wide as the map.
-        "radius": radius_for(dims) if dims <= 3 else None,
+        "dims": dims,
+        "pairs": pairs,
+        "radius": radius_for(dims),
         "probability": probability,
         "counts": counts,
     }

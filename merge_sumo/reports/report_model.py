@@ -48,8 +48,7 @@ class ReportModel:
         against: comparison with an earlier version; None without one.
         worst: failures, the worst first.
         spread: the listed failures: the worst of each region first.
-        near: cases that do not fail, those nearest to a failure first.
-        nearest: the listed ones of these.
+        nearest: the listed cases that do not fail, those nearest to a failure.
         error_groups: messages of errors and timeouts, with the listed cases of each.
         shown: cases that the page holds one by one, in their order.
         regions: region of each failure, by its index.
@@ -78,10 +77,10 @@ class ReportModel:
         self.summary = summarise(run.outcomes, run.levels, run.tolerated)
         self.facts = facts_of(run, self.summary)
         self.levels = list(self.summary.levels)
-        self.surfaces: dict[int, Surface | None] = dict.fromkeys(self.levels)
-        if learns:
-            for level in self.levels:
-                self.surfaces[level] = learn_surface(run.outcomes, level, run.tolerated)
+        self.surfaces: dict[int, Surface | None] = {}
+        for level in self.levels:
+            surface = learn_surface(run.outcomes, level, run.tolerated) if learns else None
+            self.surfaces[level] = surface
         self.coordinates = coordinates(run.scenario, self.levels or LEVELS)
         self.axes = {level: coordinates(run.scenario, (level,)) for level in self.levels}
         self.shares: dict[int, LevelShare] = {}
@@ -103,13 +102,6 @@ class ReportModel:
 
     def _choose_cases(self) -> None:
         """Choose the cases that are listed, and those that the page holds one by one."""
-        passing: list[Outcome] = []
-        untested: list[Outcome] = []
-        for outcome in self.run.cases:
-            if not outcome.is_tested or outcome.margin is None:
-                untested.append(outcome)
-            elif not outcome.failed:
-                passing.append(outcome)
         self.worst = failures(self.run.cases)
         self.regions = regions_of(self.worst)
         self.spread = spread_failures(self.worst)
@@ -117,14 +109,17 @@ class ReportModel:
             robust = set(self.stress.robust)
             self.spread.sort(key=lambda outcome: outcome.index not in robust)
         self.spread = self.spread[:LISTED]
-        self.near = sorted(passing, key=lambda outcome: (outcome.margin, outcome.index))
-        self.nearest = self.near[:LISTED]
+        others = [outcome for outcome in self.run.cases if not outcome.failed]
+        # Those without a verdict, then those nearest to a failure.
+        others.sort(key=lambda one: (one.passes, one.margin or 0.0, one.index))
+        passing = [one for one in others if one.passes and one.margin is not None]
+        self.nearest = passing[:LISTED]
         self.error_groups: list[tuple[ErrorGroup, list[Outcome]]] = []
         first: list[Outcome] = []
         for group in self.summary.error_groups[:LISTED]:
             examples = [self.run.outcome(index) for index in group.cases[:LISTED]]
             self.error_groups.append((group, examples))
             first += examples
-        first += self.spread + self.nearest + self.worst + untested + self.near
+        first += self.spread + self.nearest + self.worst + others
         by_index = {outcome.index: outcome for outcome in first}
         self.shown = sorted(list(by_index.values())[:SHOWN], key=lambda outcome: outcome.index)

@@ -30,7 +30,7 @@ from merge_sumo.metrics.fmc import fmc
 from merge_sumo.metrics.measures import recorded_measures
 from merge_sumo.metrics.merge import Conflict
 from merge_sumo.metrics.outcome import Outcome
-from merge_sumo.metrics.plausibility import late_errors
+from merge_sumo.metrics.plausibility import doubts, late_errors
 from merge_sumo.metrics.timeline import Event, Timeline, timeline
 from merge_sumo.printable import counted, either, printable
 from merge_sumo.result import lines_of
@@ -411,27 +411,26 @@ def changes(found: Explanation, case: Case) -> Iterator[str]:
         found: the explanation.
         case: the failing case.
     """
-    for axis in found.start:
-        yield _axis(axis, *name_and_unit(case, axis.name))
-    for axis in found.parameters:
-        yield _axis(axis, f"the VUT's {axis.name}", "")
+    for axis, name, unit in axes_of(found, case):
+        yield _axis(axis, name, unit)
     for level, passed in found.levels.items():
         psi = f", psi {PSI:g}" if level == level_name(2) else ""
         verb = "passes" if passed else "does not pass"
         yield f"the same start {verb} at level {level}{psi}"
 
 
-def name_and_unit(case: Case, field: str) -> tuple[str, str]:
-    """Return name and unit of a coordinate.
+def axes_of(found: Explanation, case: Case) -> Iterator[tuple[Axis, str, str]]:
+    """Yield what was changed in an explanation, with its name and its unit.
 
     Args:
-        case: a case that has it.
-        field: its field of `Case`; an unknown one is its own name.
+        found: the explanation.
+        case: the failing case.
     """
-    for coordinate in coordinates(case.scenario, (case.level,)):
-        if coordinate.field == field:
-            return coordinate.name, coordinate.unit
-    return field, ""
+    known = {c.field: (c.name, c.unit) for c in coordinates(case.scenario, (case.level,))}
+    for axis in found.start:
+        yield axis, *known.get(axis.name, (axis.name, ""))
+    for axis in found.parameters:
+        yield axis, f"the VUT's {axis.name}", ""
 
 
 def _axis(axis: Axis, name: str, unit: str) -> str:
@@ -456,7 +455,19 @@ def vut_check_lines(found: VutCheck) -> list[str]:
     return lines
 
 
-# Single cases
+# Campaigns and single cases
+
+
+def notes_of(run: RecordedCampaign) -> list[str]:
+    """Return sentences on doubts about a campaign, and on cases that ran again.
+
+    Args:
+        run: the campaign.
+    """
+    notes = doubts(run.cases, run.settings.in_vain)
+    if run.settings.ran_again:
+        notes.append(run.ran_again_in_words)
+    return notes
 
 
 def timelines(run: RecordedCampaign, outcomes: Sequence[Outcome]) -> dict[int, Timeline]:
@@ -517,14 +528,12 @@ def _measures(outcome: Outcome) -> Iterator[str]:
         value = found.value(name)
         if measure.label and value is not None:
             label = scenario.wording(measure.label).replace("POV", car)
-            rows.append((label, f"{value:10.2f} {measure.unit}"))
+            rows.append((f"  {label}", f"{value:8.2f} {measure.unit}"))
     if found.clipped_steps:
-        rows.append(("steps beyond its limits", f"{found.clipped_steps:10d}"))
+        rows.append(("  steps beyond its limits", f"{found.clipped_steps:8d}"))
     if outcome.is_tested and found.error is not None:
-        rows.append(("error after M", found.error))
-    width = max(len(label) for label, _ in rows)
-    for label, value in rows:
-        yield f"  {label:<{width}} {value}".rstrip()
+        rows.append(("  error after M", found.error))
+    yield from aligned(rows, left=2)
 
 
 def _motion_lines(trajectory: Trajectory, first: int) -> list[str]:

@@ -230,7 +230,7 @@ def test_the_timeline_and_the_changes_of_a_failure_are_drawn_and_said(browser, t
         texts = page.locator("#why-changes text:not(.edge)").all_text_contents()
         signed = [f"{value:.1f}".replace("-", "\u2212") for value in (x_m, below_m, above_m)]
         of_start = [f"x_POV0 {signed[0]} m", *signed[1:], f"v_POV0 {v_mps:.2f} m/s", "25.50"]
-        assert texts == [*of_start, "vut: gap_m 16.20", "14.10"]
+        assert texts == [*of_start, "the VUT's gap_m 16.20", "14.10"]
         listed = page.locator("#case-timeline li").all_text_contents()
         assert listed == [f"{event.time_s:.1f} s {event.text}" for event in told.events]
         marks = page.locator("#marks button")

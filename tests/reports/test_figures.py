@@ -63,7 +63,7 @@ def test_a_file_is_the_same_for_the_same_numbers(tmp_path, kind):
     assert first.read_bytes() == second.read_bytes()
 
 
-def test_a_figure_without_matplotlib_is_refused_in_a_sentence(tmp_path, monkeypatch):
+def test_a_figure_without_matplotlib_is_refused_in_a_sentence(monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     with pytest.raises(UserError, match=r"pip install 'merge-sumo\[plot\]'"):
-        figures.check_figure(tmp_path / "f.png")
+        figures.require("matplotlib")

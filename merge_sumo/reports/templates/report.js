@@ -1,5 +1,4 @@
 // The report around its player (player.js): maps, the view of a case, and the table of all cases.
-const PLACE = data.place; // M, or what merges from an acceleration lane are called
 const coordinates = data.coordinates; // of all levels; the last ones are those of some levels only
 const place = new Map(cases.index.map((index, i) => [index, i]));
 
@@ -9,9 +8,10 @@ const undecided = (i) => cases.undecided[i]; // it fails, and ran too seldom to 
 let matching = null; // the cases that the filters let through; null without a filter
 const wanted = (i) => matching === null || matching.has(i);
 function avoidedBy(i, who) { // a driver, "pov" or "none"
-  const by = failed(i) ? cases.avoided_by[i] : null;
-  if (by === null) return false;
-  return who === "pov" ? cases.pov_careful[i] : who === "none" ? by.length === 0 : by.includes(who);
+  const known = failed(i) ? cases.avoidance[i] : null;
+  if (known === null) return false;
+  const by = known.avoided_by;
+  return who === "pov" ? known.pov_careful : who === "none" ? by.length === 0 : by.includes(who);
 }
 const tested = (i) => failed(i) || cases.end[i] === "MERGED";
 const severity = (i) => cases.severity[i];
@@ -85,9 +85,10 @@ function FailureMap(figure) {
   const [left, top, width, height] = BOX;
   const X = (u) => left + u * width, Y = (v) => top + (1 - v) * height; // of shares of the pool
   const own = cases.index.map((_, i) => i).filter((i) => cases.level[i] === level);
-  const third = of.through === null ? null : coordinates[of.through]; // the reader moves through it
+  const third = of.dims === 3 ? coordinates[2] : null; // the reader moves through it
   const slider = figure.querySelector("input[type=range]"), check = figure.querySelector("input[type=checkbox]");
   const pairs = figure.querySelector("select");
+  for (const pair of of.pairs) pairs?.add(new Option(pair.map((k) => coordinates[k].name).join(" × ")));
   let pair = 0, at = 0, all = true, axes = [], marks = [];
   const apart = (i) => (all ? 0 : Math.abs(cases[third.field][i] - at));
   const near = (i) => all || apart(i) <= (third.high - third.low) / 16;
@@ -129,7 +130,7 @@ function FailureMap(figure) {
     draw(svg, "text", { transform: `translate(12 ${top + height / 2}) rotate(-90)`, "text-anchor": "middle" }, up);
     counts();
     const balls = draw(svg, "g", { class: "balls", "clip-path": "url(#clip)" });
-    for (const mark of marks) if (failed(mark.i)) ball(balls, mark, of.radius ?? 0);
+    for (const mark of marks) if (failed(mark.i)) ball(balls, mark, of.dims <= 3 ? of.radius : 0); // in more coordinates it is as wide as the map
     draw(svg, "rect", { class: "frame", x: left, y: top, width, height });
     for (const { i, x, y } of marks) {
       const faint = near(i) && wanted(i) ? "" : " faint";
@@ -445,7 +446,7 @@ function allCases() { // gives what shows the cases that the filters let through
       { name: "share of runs that fail", exact: true, value: (i) => { const runs = runsOf(i); return runs ? runs.failed / runs.number : tested(i) ? Number(failed(i)) : null; }, text: (value) => fixed(value, 2) },
     ] : []),
     number("margin", "margin", 2),
-    ...data.measures.filter(({ name }) => cases[name]?.some((value) => value !== null)).map((measure) => number(measure.name, measure.title, measure.digits)),
+    ...data.measures.filter(({ name }) => cases[name]?.some((value) => value !== null)).map(({ name, title, unit, digits }) => number(name, `${title} ${unit.replace("s2", "s²")}`.trim(), digits)),
   ];
   const all = cases.index.map((_, i) => i), PART = 100;
   let by = columns.find(({ name }) => name === "margin"), way = 1, found = all, rows = 0;
