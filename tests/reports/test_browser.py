@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -168,6 +169,11 @@ def test_the_first_screen_answers(browser, made):
         assert panel["top"] < 500
         assert road["bottom"] < 860
         assert page.inner_text("#case-role") == "Worst case"
+        assert page.locator("#case-link").get_attribute("href") == f"#case-{chosen(page)}"
+        assert page.locator("#marks button").last.get_attribute("class") == "", "of no car"
+        heights = page.locator(".charts figcaption:visible").evaluate_all(box)
+        assert len({one["height"] for one in heights}) == 1
+        assert not re.search(r"(^|\s)-\d", page.inner_text(".first"), re.MULTILINE)
         region = page.locator(".regions tbody tr").first
         level, number, _, found, _ = region.locator("td").all_inner_texts()
         region.locator("button").click()

@@ -328,7 +328,7 @@ function showMotion(i) {
 function timeline(i) { // the events of a case as a list, and as marks on the time axis of the player
   const marks = [], lines = [], end = moving && (moving.rows - 1) * DT;
   for (const [n, [t, words, actor]] of cases.events[i].entries()) {
-    const text = signed(words), car = n + 1 < cases.events[i].length ? actor : null; // the last one is the outcome
+    const text = signed(words), car = (failed(i) && n + 1 === cases.events[i].length) || /^the VUT (reaches|merges) /.test(text) ? null : actor; // the outcome is of no car
     const line = document.createElement("li"), button = document.createElement("button");
     Object.assign(button, { type: "button", textContent: `${fixed(t, 1)} s`, disabled: !moving });
     button.addEventListener("click", () => { play(false); at(t / DT); });
