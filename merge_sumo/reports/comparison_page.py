@@ -18,7 +18,6 @@ from merge_sumo.reports.pages import page
 from merge_sumo.reports.report_data import columns, motion_row, packed, player_data
 from merge_sumo.reports.text import change_in_words
 from merge_sumo.road.loader import centre_lines, road_or_shipped
-from merge_sumo.scenario.case import coordinates
 
 SHOWN = 1000
 """Maximum number of cases of a page that are listed, with both motions."""
@@ -67,7 +66,7 @@ def _maps(shown: ShownCases) -> dict[tuple[int, int], Any]:
     maps: dict[tuple[int, int], Any] = {}
     for number, (version_change, one) in reversed(list(enumerate(shown))):
         case = one.earlier.case
-        axes = coordinates(case.scenario, (case.level,))
+        axes = case.scenario.dimensions(case.level)
         found = maps.setdefault((version_change.number, case.level), (axes, []))
         found[1].append((one.change, case, number))
     return dict(sorted(maps.items()))

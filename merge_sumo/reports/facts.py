@@ -155,9 +155,9 @@ def _counts(run: RecordedCampaign, summary: Summary, failing: str) -> Facts:
         yield Fact(UNDECIDED, summary.undecided, "draw")
     if summary.failures:
         yield Fact("failures with contact", summary.contacts, f"{failing}, severity: contact")
-    contacts = [one for one in run.cases if one.measures.severity == Severity.CONTACT]
-    if others := sum(not one.failed for one in contacts):
-        yield Fact(CONTACT, others, f"severity: contact, not {failing}")
+    others = [one for one in run.cases if not one.failed]
+    if contacts := sum(one.measures.severity == Severity.CONTACT for one in others):
+        yield Fact(CONTACT, contacts, f"severity: contact, not {failing}")
 
 
 def _of_level(run: RecordedCampaign, level: int, summary: LevelSummary, failing: str) -> Facts:

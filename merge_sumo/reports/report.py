@@ -34,7 +34,7 @@ from merge_sumo.reports import facts
 from merge_sumo.reports.comparison_page import AGAINST_PAGE, comparison_page
 from merge_sumo.reports.pages import page, replace_page
 from merge_sumo.reports.report_data import page_data
-from merge_sumo.reports.report_model import INDEX, ReportModel
+from merge_sumo.reports.report_model import ReportModel
 from merge_sumo.reports.text import notes_of, robustness
 
 REPORT = "report.html"
@@ -86,22 +86,20 @@ def report_page(model: ReportModel, *, running: bool = False) -> str:
         scripts=("player.js", "report.js"),
         every_s=REPORT_EVERY_S if running else 0,
         now=f"{datetime.now().astimezone():%H:%M:%S}",
-        index=str(INDEX),
         data=Markup(data),  # noqa: S704 (JSON without "<")
         # Of this campaign.
         model=model,
         warning=unrepeatable(read_second_runs(run)),
         notes=notes_of(run),
-        go_on=campaign_command("resume", run.folder, run.record),
         printed=end_of(run.folder / LOG),
         of={fact.name: fact for fact in model.facts if fact.level is None},
-        measure=campaign_command("probability", run.folder, run.record),
         kinds=Counter(one.kind for one in model.timelines.values() if one.kind).most_common(),
         # Constants of the sections.
         names=facts,
         kind_meanings=KINDS,
-        references=list(REFERENCE_DRIVERS),
+        references=REFERENCE_DRIVERS,
         # Functions that the sections call.
+        campaign_command=campaign_command,
         meanings=meanings,
         robustness=robustness,
         radius_for=radius_for,

@@ -154,8 +154,7 @@ def _row(model: ReportModel, outcome: Outcome) -> dict[str, Any]:
         if runs := model.repeated.get(index):
             low, high = clopper_pearson(runs.failures, runs.runs, CONFIDENCE)
             each = [(run.index, run.failed) for run in runs.outcomes]
-            row["runs"] = {"failed": runs.failures, "number": runs.runs, "each": each}
-            row["runs"] |= {"low": low, "high": high}
+            row["runs"] = {"each": each, "low": low, "high": high}
     return row
 
 

@@ -8,7 +8,6 @@ from merge_sumo.analysis.explanation import EXPLANATIONS
 from merge_sumo.analysis.share import SHARES, LevelShare
 from merge_sumo.analysis.stress import STRESS
 from merge_sumo.analysis.surface import Surface, learn_surface
-from merge_sumo.campaigns.printed_commands import campaign_command
 from merge_sumo.campaigns.recorded import RecordedCampaign, failures, regions_of, spread_failures
 from merge_sumo.metrics.failure_regions import FailureRegion, failure_regions
 from merge_sumo.metrics.outcome import Outcome
@@ -23,8 +22,6 @@ LISTED = 10
 """Cases in a list, and messages of errors and timeouts."""
 SHOWN = 2000
 """Cases that the page holds one by one, with their motion; more are shown as counts."""
-INDEX = 987_654_321
-"""Index of a case in a command, where the page fills in that of the case it shows."""
 
 
 class ReportModel:
@@ -55,7 +52,6 @@ class ReportModel:
         motion: trajectories of the shown cases by index; lost ones are missing.
         timelines: timelines of the shown cases by index.
         described: regions of the pool where cases fail, in words, by level.
-        explain: command that explains the case `INDEX`.
 
     Example:
         >>> model = ReportModel(ms.open_run("runs/latest").recorded, learns=False)
@@ -82,7 +78,7 @@ class ReportModel:
             surface = learn_surface(run.outcomes, level, run.tolerated) if learns else None
             self.surfaces[level] = surface
         self.coordinates = coordinates(run.scenario, self.levels or LEVELS)
-        self.axes = {level: coordinates(run.scenario, (level,)) for level in self.levels}
+        self.axes = {level: run.scenario.dimensions(level) for level in self.levels}
         self.shares: dict[int, LevelShare] = {}
         known = SHARES.read(run.folder)
         for one in known.levels if known else ():
@@ -98,7 +94,6 @@ class ReportModel:
         self.described: list[FailureRegion] = []
         for level in self.levels:
             self.described += failure_regions(run.cases, level, self.regions)
-        self.explain = campaign_command("explain", run.folder, run.record, INDEX)
 
     def _choose_cases(self) -> None:
         """Choose the cases that are listed, and those that the page holds one by one."""

@@ -35,7 +35,7 @@ from merge_sumo.metrics.timeline import Event, Timeline, timeline
 from merge_sumo.printable import counted, either, printable
 from merge_sumo.result import lines_of
 from merge_sumo.road.loader import centre_lines, road_for, road_or_shipped
-from merge_sumo.scenario.case import Case, coordinates
+from merge_sumo.scenario.case import Case
 from merge_sumo.scenario.scenario import DT_S, NAMES, VEHICLES, level_name
 from merge_sumo.scenario.trajectory import Trajectory
 
@@ -426,7 +426,7 @@ def axes_of(found: Explanation, case: Case) -> Iterator[tuple[Axis, str, str]]:
         found: the explanation.
         case: the failing case.
     """
-    known = {c.field: (c.name, c.unit) for c in coordinates(case.scenario, (case.level,))}
+    known = {c.field: (c.name, c.unit) for c in case.scenario.dimensions(case.level)}
     for axis in found.start:
         yield axis, *known.get(axis.name, (axis.name, ""))
     for axis in found.parameters:

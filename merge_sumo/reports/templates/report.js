@@ -23,7 +23,10 @@ function drawMark(parent, i, x, y, faint) { // shape and colour by severity; wha
   if (found === null) return draw(parent, "rect", { ...look, x: x - 3, y: y - 3, width: 6, height: 6 });
   return draw(parent, "circle", { ...look, cx: x, cy: y, r: large ? 4.2 : found === "safe" ? 2.4 : 3.2 });
 }
-const runsOf = (i) => (cases.runs ? cases.runs[i] : null); // of a case that ran more than once
+function runsOf(i) { // of a case that ran more than once
+  const runs = cases.runs?.[i] ?? null;
+  return runs && { ...runs, number: runs.each.length, failed: runs.each.filter(([, fails]) => fails).length };
+}
 function drawShare(parent, i, x, y, faint) { // an arc from the top, clockwise: the share of its runs that fail
   const runs = runsOf(i), share = runs && 100 * runs.failed / runs.number;
   if (!share || share === 100) return;
