@@ -362,8 +362,7 @@ def estimate(counted: Sequence[Counted], confidence: float) -> Estimate:
         cases = sum(one.cases for one in group)
         failures = sum(one.failures for one in group)
         unjudged = sum(one.without_verdict for one in group)
-        one_low, _ = clopper_pearson(failures, cases, of_stratum)
-        _, one_high = clopper_pearson(failures + unjudged, cases, of_stratum)
+        one_low, one_high = clopper_pearson(failures, cases, of_stratum, unjudged)
         expects_failures = group[0].cells.expects_failures
         strata.append(
             Stratum(expects_failures, share, cases, failures, unjudged, one_low, one_high)

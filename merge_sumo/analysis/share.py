@@ -59,10 +59,7 @@ class LevelShare(Record, frozen=True):
         Cases without a verdict count as safe for its lower end, and as failures for its upper end.
         """
         confidence = CONFIDENCE if self.failures else 2.0 * CONFIDENCE - 1.0
-        most = self.failures + self.without_verdict
-        low, _ = clopper_pearson(self.failures, self.cases, confidence)
-        _, high = clopper_pearson(most, self.cases, confidence)
-        return low, high
+        return clopper_pearson(self.failures, self.cases, confidence, self.without_verdict)
 
     @property
     def shown(self) -> str:

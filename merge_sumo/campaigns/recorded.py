@@ -30,9 +30,9 @@ from merge_sumo.metrics.summary import RunsOfCase, failing_cases, one_per_case
 from merge_sumo.printable import counted, printable
 from merge_sumo.records import RecordError, convert, decode, read_arrays
 from merge_sumo.scenario.case import FloatArray, to_unit
-from merge_sumo.scenario.scenario import ALL_LEVELS, DT_S, Scenario
+from merge_sumo.scenario.scenario import ALL_LEVELS, Scenario
 from merge_sumo.scenario.signals import SignalRuns, Signals, from_runs
-from merge_sumo.scenario.trajectory import Trajectory, cut_at
+from merge_sumo.scenario.trajectory import Trajectory
 
 SETTINGS = "campaign.json"
 OUTCOMES = "outcomes.jsonl"
@@ -226,17 +226,7 @@ class RecordedCampaign:
         if whole is None:
             path = batch_file(self.folder, outcome.batch)
             raise NoTrajectoryError(f"{path} has no trajectory of case {index}")
-        measures = outcome.measures
-        motion, after = cut_at(whole, round(measures.t_end_s / DT_S))
-        return Trajectory(
-            outcome.case,
-            motion,
-            measures.end,
-            measures.error,
-            measures.clipped_steps,
-            after,
-            self._signals.get(index),
-        )
+        return outcome.trajectory(whole, self._signals.get(index))
 
     def trajectories(self, indices: Iterable[int]) -> dict[int, Trajectory]:
         """Return the trajectories of cases by index, without those that are lost.

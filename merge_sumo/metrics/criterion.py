@@ -273,18 +273,12 @@ def values_of(measures: Measures, names: Iterable[str] | None = None) -> dict[st
     }
     values: dict[str, Value] = {}
     for name in vocabulary() if names is None else names:
-        value = measures.value(name)
-        if value is None:
-            value = _in_place_of_none(name, is_too_late=is_too_late.get(name, False))
+        value, measure = measures.value(name), known_measures()[name]
+        if value is None and measure.missing is None:  # a text
+            value = ""
+        elif value is None and is_too_late.get(name):
+            value = math.inf if measure.worse == "high" else -math.inf
+        elif value is None:
+            value = measure.missing
         values[name] = value if isinstance(value, str) else float(value)
     return values
-
-
-def _in_place_of_none(name: str, *, is_too_late: bool) -> Value:
-    """Return what a condition compares where a measure has no value."""
-    measure = known_measures()[name]
-    if measure.missing is None:  # a text
-        return ""
-    if is_too_late:
-        return math.inf if measure.worse == "high" else -math.inf
-    return measure.missing

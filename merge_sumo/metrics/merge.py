@@ -66,10 +66,8 @@ def merged_rows(trajectory: Trajectory) -> NDArray[np.bool_]:
     Args:
         trajectory: the motion.
     """
-    merged = np.zeros(len(trajectory.whole), dtype=np.bool_)
-    leaves = trajectory.case.scenario.lane_m is not None and trajectory.end is End.MERGED
-    merged[len(trajectory.motion) - 1 :] = leaves
-    return merged
+    after = np.arange(len(trajectory.whole)) >= len(trajectory.motion) - 1
+    return after & (trajectory.case.scenario.lane_m is not None and trajectory.end is End.MERGED)
 
 
 def brake_after_mps2(trajectory: Trajectory) -> float:

@@ -15,8 +15,9 @@ from merge_sumo.metrics.measures import FOLLOW_UP, OURS, Measures, recorded_meas
 from merge_sumo.metrics.paper import margin_of
 from merge_sumo.records import Record, convert, decode, record_type, to_plain
 from merge_sumo.scenario.case import Case, FloatArray
-from merge_sumo.scenario.scenario import Scenario
-from merge_sumo.scenario.trajectory import End, Trajectory
+from merge_sumo.scenario.scenario import DT_S, Scenario
+from merge_sumo.scenario.signals import Signals
+from merge_sumo.scenario.trajectory import End, Trajectory, cut_at
 
 NO_GAP = 100.0 / 3.0
 """Gap of a VUT that never arrives, in units of the limit: another car goes first, far away."""
@@ -140,6 +141,18 @@ class Outcome:
         if self.prediction is not None:
             record["foretold"] = to_plain(self.prediction)
         return record
+
+    def trajectory(self, whole: FloatArray, signals: Signals | None = None) -> Trajectory:
+        """Return the trajectory of the case from its recorded motion.
+
+        Args:
+            whole: motion up to M and after it, (T + 1, A, 3).
+            signals: signals of the VUT.
+        """
+        found = self.measures
+        until_m, after = cut_at(whole, round(found.t_end_s / DT_S))
+        fault = found.error, found.clipped_steps
+        return Trajectory(self.case, until_m, found.end, *fault, after, signals)
 
     @classmethod
     def from_json(cls, line: bytes | str, scenario: Scenario) -> Outcome:

@@ -177,7 +177,9 @@ def is_decided(failures: int, runs: int, tolerated: float) -> bool:
     return float(betainc(failures - 0.5, runs - failures + 0.5, tolerated)) <= DOUBT
 
 
-def clopper_pearson(failures: int, cases: int, confidence: float) -> tuple[float, float]:
+def clopper_pearson(
+    failures: int, cases: int, confidence: float, without_verdict: int = 0
+) -> tuple[float, float]:
     """Return the exact interval of a probability by independent cases; (0, 1) without any.
 
     Source: Clopper and Pearson (1934). Cases that a sampler has chosen are not independent.
@@ -186,6 +188,8 @@ def clopper_pearson(failures: int, cases: int, confidence: float) -> tuple[float
         failures: number of failures.
         cases: number of independent cases.
         confidence: confidence level of the interval.
+        without_verdict: number of cases without a verdict; they count as safe for the lower end,
+            and as failures for the upper one.
 
     Returns:
         Lower and upper end.
@@ -194,8 +198,10 @@ def clopper_pearson(failures: int, cases: int, confidence: float) -> tuple[float
 
     if not cases:
         return 0.0, 1.0
-    found = binomtest(failures, cases).proportion_ci(confidence, method="exact")
-    return float(found.low), float(found.high)
+    low, _ = binomtest(failures, cases).proportion_ci(confidence, method="exact")
+    most = failures + without_verdict
+    _, high = binomtest(most, cases).proportion_ci(confidence, method="exact")
+    return float(low), float(high)
 
 
 MESSAGE_CHARACTERS = 300

@@ -34,7 +34,7 @@ from merge_sumo.scenario.scenario import (
     VUT,
     Scenario,
 )
-from merge_sumo.scenario.trajectory import Trajectory, cut_at
+from merge_sumo.scenario.trajectory import Trajectory
 from merge_sumo.sumo.binding import run_program, scratch_folder
 from merge_sumo.sumo.replay_folder import (
     CASE,
@@ -215,15 +215,10 @@ def _read(folder: Path) -> _Episode:
             "or more rows"
         )
     motion = _motion(record, lanes, road, name)
-    measures = outcome.measures
-    end = round(measures.t_end_s / DT_S)
-    if not 0 <= end < len(motion):
-        raise UserError(f"{folder} ends at {measures.t_end_s:g} s, and its record does not")
-    until_merge, after = cut_at(motion, end)
-    trajectory = Trajectory(
-        outcome.case, until_merge, measures.end, measures.error, measures.clipped_steps, after
-    )
-    return _Episode(road, outcome, trajectory, record)
+    end_s = outcome.measures.t_end_s
+    if not 0 <= round(end_s / DT_S) < len(motion):
+        raise UserError(f"{folder} ends at {end_s:g} s, and its record does not")
+    return _Episode(road, outcome, outcome.trajectory(motion), record)
 
 
 def _outcome(path: Path) -> Outcome:

@@ -245,7 +245,7 @@ class SumoSimulation:
         except (self._libsumo.TraCIException, self._libsumo.FatalTraCIError) as error:
             raise SimulationError(str(error)) from error
 
-    def wanted_v_mps(self, rows: Sequence[int] = (VUT,)) -> FloatArray:
+    def wanted_v_mps(self, rows: Sequence[int]) -> FloatArray:
         """Return the speeds that SUMO's own models chose in its step, (R corridors,), row by row.
 
         They mean something of vehicles that SUMO drives.
