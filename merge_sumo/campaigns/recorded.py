@@ -9,10 +9,11 @@ against/                  the same of the earlier version, where a campaign is a
 
 from __future__ import annotations
 
-from collections import Counter, defaultdict
+from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, fields, replace
+from itertools import count
 from pathlib import Path
 from typing import Annotated, Any, Final, TypeVar
 
@@ -416,13 +417,12 @@ def spread_failures(outcomes: Iterable[Outcome]) -> list[Outcome]:
     """
     worst_first = failures(outcomes)
     region = regions_of(worst_first)
-    before: Counter[tuple[int, int]] = Counter()
-    turns: dict[int, int] = {}
-    for outcome in worst_first:
-        place = outcome.case.level, region[outcome.index]
-        turns[outcome.index] = before[place]
-        before[place] += 1
-    return sorted(worst_first, key=lambda outcome: turns[outcome.index])
+    turns: defaultdict[tuple[int, int], count[int]] = defaultdict(count)
+
+    def turn(outcome: Outcome) -> int:
+        return next(turns[outcome.case.level, region[outcome.index]])
+
+    return sorted(worst_first, key=turn)
 
 
 def has_converged(outcomes: Sequence[Outcome], tolerated: float = 0.0) -> bool:

@@ -100,18 +100,18 @@ def encounters(trajectories: Sequence[Trajectory], lines: CentreLines | None) ->
     if not trajectories:
         return []
     lines = lines or ONE_LANE
-    rows, before, merged, motions = [], [], [], []
+    rows, merged, motions = [], [], []
     for trajectory in trajectories:
         whole, merge = trajectory.whole, one_lane_row(trajectory)
         together = whole[:, VUT, 0] > -lines.together_m
         rows.append(np.flatnonzero(together | (np.arange(len(whole)) >= merge)))
         motions.append(whole[rows[-1]])
         merged.append(rows[-1] >= merge)
-        before.append(together[rows[-1]] & (motions[-1][:, VUT, 0] < 0.0))
-    scenario = trajectories[0].case.scenario
-    apart = _apart(scenario, np.concatenate(motions), np.concatenate(merged), lines)
-    parts = np.split(apart, np.cumsum([len(one) for one in rows])[:-1], axis=1)
-    return [_encounter(*one) for one in zip(rows, before, parts, strict=True)]
+    scenario, motion = trajectories[0].case.scenario, np.concatenate(motions)
+    apart = _apart(scenario, motion, np.concatenate(merged), lines)
+    x_m, ends = motion[:, VUT, 0], np.cumsum(list(map(len, rows)))[:-1]
+    before = np.split((x_m > -lines.together_m) & (x_m < 0.0), ends)
+    return list(map(_encounter, rows, before, np.split(apart, ends, axis=1)))
 
 
 def one_lane_row(trajectory: Trajectory) -> int:
