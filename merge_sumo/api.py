@@ -191,7 +191,11 @@ def campaign(config: c.Campaign) -> CampaignRun:
     settings = settings_from_config(config)
     folder = dated(settings.vut) if config.out is None else Path(config.out)
     plan = settings.load_plan()
-    notice_povs(settings, plan)
+    if {1, 2} & set(settings.levels) and unseen(settings.scenario, plan.povs.policies):
+        notice(
+            f"the POVs of levels 1 and 2 were not trained on {settings.scenario.name}: "
+            "`merge-sumo scenario check SCENARIO` lists the differences"
+        )
     check_new(folder)
     return run_and_report(settings, plan, folder, config)
 
@@ -354,12 +358,12 @@ def open_in_gui(folder: c.AnyRun, index: int | None = None, *, from_s: float | N
 def _scenario_folder(folder: c.AnyRun, index: int | None) -> Path:
     """Return the replay folder of a case, written where it does not exist yet."""
     path = folder_of(folder)
-    if index is None and not (path / SETTINGS).is_file():
-        return path
     if index is None:
-        raise UserError(
-            f"{path} is a campaign: say which case, as in `merge-sumo replay {quoted(path)} 0`"
-        )
+        if (path / SETTINGS).is_file():
+            raise UserError(
+                f"{path} is a campaign: say which case, as in `merge-sumo replay {quoted(path)} 0`"
+            )
+        return path
     exported = path / SCENARIOS / case_name(index)
     if not (exported / CONFIG).is_file():
         export(folder, index)
@@ -643,17 +647,3 @@ def run_and_report(
     if junit is not None:
         write_junit(junit, result)
     return result
-
-
-def notice_povs(settings: CampaignSettings, plan: SimulationPlan) -> None:
-    """Warn with a `Notice` of POVs that were not trained on the scenario.
-
-    Args:
-        settings: the settings of a new campaign.
-        plan: how its cases run.
-    """
-    if {1, 2} & set(settings.levels) and unseen(settings.scenario, plan.povs.policies):
-        notice(
-            f"the POVs of levels 1 and 2 were not trained on {settings.scenario.name}: "
-            "`merge-sumo scenario check SCENARIO` lists the differences"
-        )

@@ -109,11 +109,11 @@ class ReportModel:
         others.sort(key=lambda one: (one.passes, one.margin or 0.0, one.index))
         passing = [one for one in others if one.passes and one.margin is not None]
         self.nearest = passing[:LISTED]
-        self.error_groups: list[tuple[ErrorGroup, list[Outcome]]] = []
+        self.error_groups: dict[ErrorGroup, list[Outcome]] = {}
         first: list[Outcome] = []
         for group in self.summary.error_groups[:LISTED]:
             examples = [self.run.outcome(index) for index in group.cases[:LISTED]]
-            self.error_groups.append((group, examples))
+            self.error_groups[group] = examples
             first += examples
         first += self.spread + self.nearest + self.worst + others
         by_index = {outcome.index: outcome for outcome in first}
