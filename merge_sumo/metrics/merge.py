@@ -70,22 +70,31 @@ def merged_rows(trajectory: Trajectory) -> NDArray[np.bool_]:
     return after & (trajectory.case.scenario.lane_m is not None and trajectory.end is End.MERGED)
 
 
-def brake_after_mps2(trajectory: Trajectory) -> float:
-    """Return the largest deceleration, in m/s2, that a car or the VUT needs after the merge.
+def brakes_needed_mps2(trajectory: Trajectory) -> FloatArray:
+    """Return the decelerations that the VUT and each other car need after the merge.
 
     Args:
         trajectory: the motion.
 
     Returns:
-        0 where no vehicle has to brake; infinite where bodies overlap or no
-        braking is in time.
+        Deceleration of the one behind in m/s2, (A - 1,): 0 where it need not brake, and infinite
+        where bodies overlap or no braking is in time. Nothing without a merge.
     """
     gap_m, closing_mps = gaps_at_m(trajectory)
     closing_mps = np.maximum(closing_mps, 0.0)
     room_m = gap_m - closing_mps * REACTION_S
-    if (room_m <= 0.0).any():
-        return math.inf
-    return float((np.square(closing_mps) / (2.0 * room_m)).max(initial=0.0))
+    needed_mps2: FloatArray = np.full(len(room_m), math.inf)
+    np.divide(np.square(closing_mps), 2.0 * room_m, out=needed_mps2, where=room_m > 0.0)
+    return needed_mps2
+
+
+def brake_after_mps2(trajectory: Trajectory) -> float:
+    """Return the largest of `brakes_needed_mps2`, in m/s2.
+
+    Args:
+        trajectory: the motion.
+    """
+    return float(brakes_needed_mps2(trajectory).max(initial=0.0))
 
 
 class Severity(StrEnum):
@@ -208,7 +217,7 @@ def last_avoidable_s(trajectory: Trajectory) -> float | None:
         for ahead in range(1, scenario.max_steps + 1):
             x = x + v * DT_S
             v = np.maximum(v + acceleration * DT_S, 0.0)
-            arrived = driving & (x >= place_m)
+            arrived = driving & (x >= place_m - 1e-9)  # without the rounding of x
             dx = x_cars[starts[arrived] + ahead] - x[arrived, None]
             avoidable[arrived] |= (np.abs(dx) >= scenario.dx_crash_m).all(axis=1)
             driving &= ~arrived

@@ -14,7 +14,7 @@ import numpy as np
 
 from merge_sumo.metrics.bodies import NONE_MET, CentreLines, Encounter, encounters
 from merge_sumo.metrics.criterion import CRITERIA, PAPER, Criterion
-from merge_sumo.metrics.merge import Severity
+from merge_sumo.metrics.merge import Severity, brakes_needed_mps2
 from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.metrics.summary import message_of
 from merge_sumo.scenario.case import Case, FloatArray, described
@@ -119,14 +119,15 @@ def timeline(
     found, rule, kind, met = outcome.measures, _rule(outcome), None, NONE_MET
     if trajectory is not None and found.impact_speed_mps is not None:
         (met,) = encounters([trajectory], lines)
-    *ends, last = sorted(_ends(outcome, trajectory, met, rule), key=lambda event: event.time_s)
-    events = [*ends, *others, *_way_out(outcome)]
+    ends = sorted(_ends(outcome, trajectory, met, rule), key=lambda event: event.time_s)
+    events, last = [*others, *_way_out(outcome), *ends], ends[-1]
     if trajectory is not None:
-        events += _phases(outcome, trajectory, {end.car for end in (*ends, last)})
+        whole = trajectory.whole
         if outcome.failed:
             kind = _kind(outcome, trajectory, last, rule)
-            events = [event for event in events if event.time_s <= last.time_s]
-    events = sorted([*events, last], key=lambda event: event.time_s)
+            whole = whole[: _row(last) + 1]
+        events += _phases(outcome, whole, {end.car for end in ends})
+    events.sort(key=lambda event: event.time_s)
     result = found.result if found.end.is_error else found.result.lower()
     if outcome.failed:
         result = f"{kind or 'failure'}, {result}"
@@ -139,6 +140,8 @@ def timeline(
 def phases(v_mps: FloatArray) -> Iterator[tuple[int, int]]:
     """Yield first and last row of each phase in which a vehicle brakes or accelerates.
 
+    A phase begins where the speed is for the last time as high, or as low, as at any time in it.
+
     Args:
         v_mps: its speeds, (T + 1,), in m/s.
     """
@@ -148,17 +151,22 @@ def phases(v_mps: FloatArray) -> Iterator[tuple[int, int]]:
         back_mps = gained_mps[rows[:-1] + 1] - gained_mps[rows[1:]]
         ends = (np.diff(rows) > PAUSE_STEPS) | (back_mps > CHANGED_MPS)
         for part in np.split(rows, np.flatnonzero(ends) + 1):
-            if part.size and gained_mps[part[-1] + 1] - gained_mps[part[0]] > CHANGED_MPS:
-                yield int(part[0]), int(part[-1]) + 1
+            if not part.size:
+                continue
+            phase_mps = gained_mps[part[0] : part[-1] + 2]
+            begin = np.flatnonzero(phase_mps <= phase_mps.min() + STEADY_MPS)[-1]
+            end = begin + phase_mps[begin:].argmax()
+            if phase_mps[end] - phase_mps[begin] > CHANGED_MPS:
+                yield int(part[0] + begin), int(part[0] + end)
 
 
-def _phases(outcome: Outcome, trajectory: Trajectory, met: set[Vehicle | None]) -> Iterator[Event]:
+def _phases(outcome: Outcome, motion: FloatArray, met: set[Vehicle | None]) -> Iterator[Event]:
     """Yield the phases of the VUT and of the cars that it meets."""
     last_s = outcome.measures.last_avoidable_s if outcome.failed else None
     for car, name in enumerate(VEHICLES):
         if car != VUT and name not in met:
             continue
-        v_mps = trajectory.whole[:, car, 1]
+        v_mps = motion[:, car, 1]
         for begin, end in phases(v_mps):
             time_s, brakes = _time_s(begin), v_mps[end] < v_mps[begin]
             does = "brakes" if brakes else "accelerates"
@@ -208,20 +216,23 @@ def _ends(
         text += f": contact {impact}"
     elif rule == PAPER:
         text += f": closer than {scenario.dx_crash_m:g} m"
-    elif rule is not None and contact_s is None:
-        needed = found.brake_after_mps2
-        text += f": braking of {needed:.1f} m/s2 must follow" if needed else ": too near to brake"
+    elif rule is not None and contact_s is None and trajectory is not None:
+        text += f": {_must_brake(trajectory)}"
     if rule in (None, PAPER) or contact_s is None or contact_s >= found.t_end_s:
         yield Event(found.t_end_s, text, found.nearest)
     if trajectory is None:
         return
     hardest_mps2 = found.after_brake_mps2
-    if hardest_mps2 and contact_s is None and (rule or found.severity == Severity.HARSH):
+    is_told = rule != PAPER and (rule or found.severity == Severity.HARSH)
+    if hardest_mps2 and contact_s is None and is_told:
         a_mps2 = trajectory.whole[len(trajectory.motion) - 1 :, :, 2]
         row, index = divmod(int(np.abs(a_mps2 + hardest_mps2).argmin()), len(a_mps2[0]))
-        text = f"the {NAMES[VEHICLES[index]]} brakes hardest after the merge"
-        time_s = round(found.t_end_s + row * DT_S, 1)
-        yield Event(time_s, f"{text}: -{hardest_mps2:.1f} m/s2", VEHICLES[index])
+        row += len(trajectory.motion) - 1
+        text = (
+            f"the {NAMES[VEHICLES[index]]} brakes hardest of those behind: -{hardest_mps2:.1f} m/s2"
+        )
+        text += f", down to {trajectory.whole[row:, index, 1].min():.1f} m/s"
+        yield Event(_time_s(row), text, VEHICLES[index])
     last_s = _time_s(len(trajectory.whole) - 1)
     if outcome.failed and rule is None and found.end is End.MERGED:
         yield Event(last_s, f"fails: margin {outcome.margin:.3g}")
@@ -229,9 +240,20 @@ def _ends(
         yield Event(last_s, f"an error ends the follow-up: {message_of(outcome)}")
 
 
+def _must_brake(trajectory: Trajectory) -> str:
+    """Return which vehicle has to brake most after the merge, and how hard."""
+    needed_mps2 = brakes_needed_mps2(trajectory)
+    at_m = trajectory.motion[-1]
+    car = np.delete(np.arange(len(at_m)), VUT)[needed_mps2.argmax()]
+    behind = car if at_m[car, 0] < at_m[VUT, 0] else VUT
+    if np.isinf(needed_mps2).any():
+        return f"the {NAMES[VEHICLES[behind]]} is too near to brake"
+    return f"the {NAMES[VEHICLES[behind]]} has to brake at -{needed_mps2.max():.1f} m/s2"
+
+
 def _kind(outcome: Outcome, trajectory: Trajectory, last: Event, rule: str | None) -> str:
     """Return the kind of a failure by the speeds before its last event."""
-    found, row = outcome.measures, round(last.time_s / DT_S)
+    found, row = outcome.measures, _row(last)
     if found.end is not End.MERGED:
         return "did not arrive"
     if rule is None:
@@ -244,8 +266,8 @@ def _kind(outcome: Outcome, trajectory: Trajectory, last: Event, rule: str | Non
     vut, other = (_trend(trajectory.whole[: row + 1, who, 1]) for who in (VUT, car))
     if vut >= 0.0:
         return "both accelerate" if vut > 0.0 and other > 0.0 else "squeeze"
-    v_mps, way_out_s = trajectory.whole[:, VUT, 1], found.last_avoidable_s
-    begun_s = [_time_s(a) for a, b in phases(v_mps) if v_mps[b] < v_mps[a] and a < row]
+    v_mps, way_out_s = trajectory.whole[: row + 1, VUT, 1], found.last_avoidable_s
+    begun_s = [_time_s(a) for a, b in phases(v_mps) if v_mps[b] < v_mps[a]]
     if found.is_close and begun_s and (way_out_s is None or begun_s[-1] > way_out_s):
         return "late brake"
     return "both brake" if other < 0.0 else "weak brake"
@@ -260,3 +282,7 @@ def _trend(v_mps: FloatArray) -> float:
 
 def _time_s(row: int) -> float:
     return round(row * DT_S, 1)
+
+
+def _row(event: Event) -> int:
+    return round(event.time_s / DT_S)

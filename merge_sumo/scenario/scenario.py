@@ -173,7 +173,12 @@ BEHIND = 3
 traffic, the cars ahead of it and behind it are cars of the mainline."""
 VEHICLES = ("pov", "vut", "ahead", "behind")
 """Names of the vehicles, by index."""
-NAMES = {"pov": "POV", "vut": "VUT", "ahead": "car ahead", "behind": "car behind"}
+NAMES = {
+    "pov": "POV",
+    "vut": "VUT",
+    "ahead": "car ahead of the POV",
+    "behind": "car behind the POV",
+}
 """Names of the vehicles in texts."""
 COLOURS = {"pov": "#e69f00", "vut": "#0072b2", "ahead": "#009e73", "behind": "#a6518b"}
 """Colours of the vehicles in every picture (Okabe and Ito, 2008); `report.css` has lighter ones for

@@ -72,6 +72,7 @@ class TestPhases:
             (BRAKES, [(30, 80)]),
             (parts((3.0, 0.0), (0.9, -1.0), (4.1, 0.0)), []),
             (parts((0.5, -1.0), (4.0, 0.0), (2.0, -1.0), (4.0, 0.0)), [(45, 65)]),
+            (parts((0.5, -1.0), (0.5, 1.0), (2.0, -1.0), (0.5, 1.0), (4.0, 0.0)), [(10, 30)]),
             (parts((1.0, -1.0), (0.9, 0.0), (1.0, -1.0), (4.0, 0.0)), [(0, 29)]),
             (parts((1.0, -1.0), (1.0, 0.0), (1.0, -1.0), (4.0, 0.0)), [(0, 10), (20, 30)]),
             (
@@ -134,9 +135,21 @@ class TestTheTimelineOfAFailure:
                 "unsafe",
                 "cut in, harsh",
                 [
-                    f"{REACHES} 9.0 m ahead of the POV: braking of 8.0 m/s2 must follow",
-                    "8.1 s   the POV brakes: 30.0 to 26.0 m/s",
-                    "8.1 s   the POV brakes hardest after the merge: -4.0 m/s2",
+                    f"{REACHES} 9.0 m ahead of the POV: the POV has to brake at -8.0 m/s2",
+                    "8.1 s   the POV brakes hardest of those behind: -4.0 m/s2, down to 26.0 m/s",
+                ],
+            ),
+            (
+                meeting(
+                    parts((3.0, 0.0), (5.0, -2.5), (3.0, 0.0)),
+                    parts((8.0, 1.0), (3.0, -4.0)),
+                    gap_m=20.0,
+                ),
+                "unsafe",
+                "squeeze, harsh",
+                [
+                    f"{REACHES} 20.0 m behind the POV: the VUT has to brake at -4.2 m/s2",
+                    "8.0 s   the VUT brakes hardest of those behind: -4.0 m/s2, down to 14.0 m/s",
                 ],
             ),
             (
@@ -152,7 +165,14 @@ class TestTheTimelineOfAFailure:
                 ["8.0 s   the VUT did not reach the merge point in 8 s"],
             ),
         ],
-        ids=["near", "contact after M", "braking", "a rule of the user", "a timeout"],
+        ids=[
+            "near",
+            "contact after M",
+            "POV behind",
+            "VUT behind",
+            "a rule of the user",
+            "a timeout",
+        ],
     )
     def test_ends_with_what_broke_its_rule(self, trajectory, fail_when, result, last):
         found = told(trajectory, fail_when)
@@ -201,8 +221,8 @@ class TestTheTimelineOfAnotherCase:
         )
         found = told(Trajectory(case, motion, End.MERGED))
         assert events(found)[1:] == [
-            "3.0 s   the car behind brakes: 30.0 to 25.0 m/s",
-            "8.0 s   the VUT reaches the merge point 30.0 m behind the car behind",
+            "3.0 s   the car behind the POV brakes: 30.0 to 25.0 m/s",
+            "8.0 s   the VUT reaches the merge point 30.0 m behind the car behind the POV",
         ]
 
 

@@ -40,8 +40,8 @@ CASES = 40
 ON_LANE = replace(named_scenario("us23-lane"), name="stop", follow_up_s=0.0, lane_end="stop")
 LENGTH_M, NEAR_M, DT_S, CHANGED_MPS = 5.0, 6.0, 0.1, 1.0
 NUMBER = r"(-?\d+(?:\.\d+)?)"
-CAR = "(VUT|POV|car ahead|car behind)"
-CARS = {"POV": 0, "VUT": 1, "car ahead": 2, "car behind": 3}
+CAR = "(VUT|POV|car ahead of the POV|car behind the POV)"
+CARS = {"POV": 0, "VUT": 1, "car ahead of the POV": 2, "car behind the POV": 3}
 
 
 def spec_of(vut: str, folder: Path) -> str:
@@ -63,6 +63,7 @@ class Motion:
         self.whole = trajectory.whole.tolist()
         self.scenario, self.ended = trajectory.case.scenario, trajectory.end
         self.end = len(trajectory.motion) - 1
+        self.last = len(self.whole) - 1
         self.others = [car for car in range(len(self.whole[0])) if car != 1]
         self.nearest = self.nearest_at(self.end)
         self.dx = self.apart(self.end, self.nearest)
@@ -80,9 +81,9 @@ class Motion:
         return self.whole[row][car][1]
 
     def phase_end(self, car: int, row: int, sign: int) -> int:
-        """Return the last row of the phase that begins at a row, up to a pause or a return."""
+        """Return where a phase that begins at a row is at its end, before a pause or a return."""
         last = row
-        for now in range(row, len(self.whole) - 1):
+        for now in range(row, self.last):
             if sign * (self.v(now + 1, car) - self.v(now, car)) >= 0.01 - 1e-6:
                 if (
                     now - last >= 10
@@ -90,7 +91,7 @@ class Motion:
                 ):
                     break
                 last = now + 1
-        return last
+        return max(range(row, last + 1), key=lambda one: sign * self.v(one, car))
 
     def trend(self, car: int, row: int) -> int:
         """Return 1 for a car that accelerates at last in the 3 s before a row, -1 for braking."""
@@ -109,7 +110,7 @@ class Motion:
             x, v = self.whole[start][1][:2]
             for step in range(start + 1, start + 301):
                 x, v = x + v * DT_S, max(v + a * DT_S, 0.0)
-                if x >= self.place_m:
+                if x >= self.place_m - 1e-9:
                     if all(abs(self.x_then(car, step) - x) >= NEAR_M for car in self.others):
                         return True
                     break
@@ -160,7 +161,9 @@ def check_event(text: str, row: int, m: Motion) -> None:
         elif more is not None and more.startswith("contact"):
             check_event(more, row, m)
         elif more is not None:
-            near(re.fullmatch(rf"braking of {NUMBER} m/s2 must follow", more)[1], needed_mps2(m))
+            name, needed = re.fullmatch(rf"the {CAR} has to brake at {NUMBER} m/s2", more).groups()
+            near(needed, -needed_mps2(m))
+            assert m.v(m.end, CARS[name]) > min(m.v(m.end, car) for car in range(len(m.whole[0])))
     else:
         check_moment(text, row, m)
 
@@ -175,8 +178,11 @@ def check_moment(text: str, row: int, m: Motion) -> None:
         assert found[1] is None or CARS[found[1]] == m.nearest_at(row)
         assert abs(m.apart(row, m.nearest_at(row))) < LENGTH_M + 0.5
         assert float(found[2]) >= abs(m.v(row, m.nearest_at(row)) - m.v(row, 1)) - 0.06
-    elif found := re.fullmatch(rf"the {CAR} brakes hardest after the merge: {NUMBER} m/s2", text):
+    elif found := re.fullmatch(
+        rf"the {CAR} brakes hardest of those behind: {NUMBER} m/s2, down to {NUMBER} m/s", text
+    ):
         near(found[2], m.whole[row][CARS[found[1]]][2])
+        near(found[3], min(m.v(now, CARS[found[1]]) for now in range(row, len(m.whole))))
         assert row >= m.end
     elif text == "last way out: full braking or full acceleration":
         near(row * DT_S, m.way_out_s())
@@ -212,6 +218,8 @@ def check(told: Timeline, outcome: Outcome, m: Motion) -> None:
     """Check all that a timeline says."""
     times = [event.time_s for event in told.events]
     assert times == sorted(times)
+    if outcome.failed:
+        m.last = round(times[-1] / DT_S)
     for event in told.events:
         check_event(event.text, round(event.time_s / DT_S), m)
     if told.kind is None or told.kind in ("rule broken", "did not arrive"):
@@ -232,7 +240,6 @@ def check(told: Timeline, outcome: Outcome, m: Motion) -> None:
 
 def check_complete(told: Timeline, m: Motion) -> None:
     """Check that each second in which a speed changes by 1 m/s is in a phase that is told."""
-    last = len(m.whole) - 1 if told.kind is None else round(told.events[-1].time_s / DT_S)
     for car in (m.nearest, 1):
         name = next(name for name, index in CARS.items() if index == car)
         phases = []
@@ -240,7 +247,7 @@ def check_complete(told: Timeline, m: Motion) -> None:
             if found := re.match(f"the {name} (brakes|accelerates): ", event.text):
                 sign, row = (-1 if found[1] == "brakes" else 1), round(event.time_s / DT_S)
                 phases.append((sign, row, m.phase_end(car, row, sign)))
-        for row in range(last - 10):
+        for row in range(m.last - 10):
             gained = m.v(row + 10, car) - m.v(row, car)
             if abs(gained) >= CHANGED_MPS:
                 sign = 1 if gained > 0.0 else -1
