@@ -171,9 +171,7 @@ class PythonObjectKind(ControllerKind):
         except UserError:
             raise
         except (Exception, SystemExit) as error:
-            how = "copied for each corridor (give its class)"
-            if self._is_class:
-                how = f"made with {corridors[0]} corridors" if corridors else "made"
+            how = "made" if self._is_class else "copied for each corridor (give its class)"
             why = f"{type(error).__name__}: {text_of(error)}"
             raise UserError(f"{self.spec} cannot be {how}: {why}") from error
         return made

@@ -6,7 +6,6 @@ import inspect
 import math
 from collections.abc import Callable, Mapping
 from inspect import Parameter
-from pathlib import Path
 from types import MemberDescriptorType
 from typing import Any
 
@@ -73,14 +72,14 @@ def check_call(function: Callable[..., Any], arguments: tuple[str, ...]) -> None
         arguments: their names.
 
     Raises:
-        UserError: if it takes others; the sentence has its file and line.
+        UserError: if it takes others.
     """
     name = getattr(function, "__name__", "it")
     if fits(function, len(arguments), seeded=name == "reset"):
         return
     parameters = ", ".join(_parameters(function))
     called = f"{name}({parameters}) is called as {name}({', '.join(arguments)})"
-    raise UserError(printable(f"{_defined_at(function)}{called}"))
+    raise UserError(printable(called))
 
 
 def fits(function: Callable[..., Any], count: int, *, seeded: bool = False) -> bool:
@@ -99,15 +98,6 @@ def fits(function: Callable[..., Any], count: int, *, seeded: bool = False) -> b
     except TypeError:
         return False
     return True
-
-
-def _defined_at(function: Callable[..., Any]) -> str:
-    """Return "FILE:LINE: " of a function; "" for one that is not written in Python."""
-    code = getattr(inspect.unwrap(function), "__code__", None)
-    if code is None:
-        return ""
-    file = code.co_filename.removeprefix(f"{Path.cwd()}/")
-    return f"{file}:{code.co_firstlineno}: "
 
 
 def defaults_of(target: Any, positional: int) -> dict[str, Any]:

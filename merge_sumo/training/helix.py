@@ -33,7 +33,6 @@ from merge_sumo.drivers.policies import (
 )
 from merge_sumo.errors import UserError
 from merge_sumo.files import check_own, make_folder, replace_own, write_new, writing
-from merge_sumo.printable import quoted
 from merge_sumo.records import to_json, to_plain
 from merge_sumo.result import Result
 from merge_sumo.road.loader import road_for
@@ -173,11 +172,6 @@ def _plan(
 ) -> dict[str, Any]:
     """Return everything that decides the weights of a network."""
     role, opponent = OPPONENTS[name]
-    command = f"merge-sumo train --only {name} --seed {seed}"
-    if not plays_as(scenario, US23):
-        command += f" --scenario {quoted(scenario.name)}"
-    if a_min_mps2 is not None:
-        command += f" --a-min {a_min_mps2:g}"
     entry = read_manifest(folder).get(opponent)
     if entry is not None and not plays_as(scenario_of(entry), scenario):
         raise UserError(
@@ -185,7 +179,6 @@ def _plan(
             f"{scenario_of(entry).name}: choose another folder with `out`"
         )
     return {
-        "command": command,
         "scenario": scenario_record(scenario),
         "role": role,
         "opponent": opponent,

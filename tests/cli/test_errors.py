@@ -36,19 +36,19 @@ class TestAWrongSignature:
         [
             (
                 "class V:\n\n    def act(self):\n        return 0.0\n",
-                "my.py:3: act(self) is called as act(self, seen)",
+                "act(self) is called as act(self, seen)",
             ),
             (
                 "class V:\n    def act_batch(self, seen): ...\n    def reset(self, seen): ...\n",
-                "my.py:3: reset(self, seen) is called as reset(self, corridor, seen)",
+                "reset(self, seen) is called as reset(self, corridor, seen)",
             ),
             (
                 "def V(x, v, *rest, gain):\n    return 0.0\n",
-                "my.py:1: V(x, v, rest, gain) is called as V(seen)",
+                "V(x, v, rest, gain) is called as V(seen)",
             ),
         ],
     )
-    def test_is_named_in_the_users_file(self, source, said, tmp_path, monkeypatch, command_line):
+    def test_is_refused_in_a_sentence(self, source, said, tmp_path, monkeypatch, command_line):
         monkeypatch.chdir(tmp_path)
         (tmp_path / "my.py").write_text(source)
         code, out, err = command_line("campaign", "--vut", "my.py:V", "--out", "run")

@@ -146,7 +146,7 @@ def test_what_cannot_be_a_vut_is_refused_in_a_sentence(write_vut, source, name, 
 
 def test_a_batched_class_that_takes_no_number_of_corridors_is_told_of_it(write_vut):
     batched = "class Vut:\n    def act_batch(self, seen):\n        return seen.t_s\n"
-    with pytest.raises(UserError, match="cannot be made with 2 corridors: TypeError"):
+    with pytest.raises(UserError, match="cannot be made: TypeError"):
         in_process(write_vut(batched)).open(2)
 
 

@@ -62,7 +62,6 @@ def test_a_shipped_library_is_complete_and_its_manifest_says_how_it_was_made(nam
         limited = name == "human" and network_name.startswith("pov")
         assert network.sees_svo == (network_name == "pov2")
         assert network.a_min_mps2 == entry.get("a_min_mps2") == (-2.0 if limited else None)
-        assert entry["command"].startswith(f"merge-sumo train --only {network_name} ")
         assert plays_as(scenario_of(entry), scenario)
         assert entry["reward_weights"] == pytest.approx(weights)
         assert entry["check"]["avoidable_collisions"] == 0

@@ -219,9 +219,7 @@ class TestTraining:
         folder, said = trained
         assert "network  mean regret" in said
         entry = read_manifest(folder)["pov1"]
-        assert (
-            entry["command"] == "merge-sumo train --only pov1 --seed 0 --scenario ring --a-min -2"
-        )
+        assert entry["seed"] == 0
         assert entry["check"]["cases"] == 4
         assert entry["a_min_mps2"] == load_network("pov1", folder).a_min_mps2 == -2.0
         assert plays_as(scenario_of(entry), LIKE_A_ROUNDABOUT)
