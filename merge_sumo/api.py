@@ -73,8 +73,8 @@ from merge_sumo.interrupt import Stopped
 from merge_sumo.metrics.merge import check_from
 from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.metrics.summary import parse_gates
-from merge_sumo.printable import either, meant, printable, quoted
-from merge_sumo.records import check_toml_size, to_plain
+from merge_sumo.printable import meant, printable, quoted
+from merge_sumo.records import to_plain
 from merge_sumo.reports import figures
 from merge_sumo.reports.cases_toml import with_file
 from merge_sumo.reports.comparison_page import PAGE, comparison_page
@@ -102,8 +102,6 @@ __all__ = ["AnyVut", "CampaignRun", "Car", "CaseRun", "Seen", "SeenBatch", "date
 P = ParamSpec("P")
 C = TypeVar("C")
 R = TypeVar("R")
-KEYWORDS: dict[str, Sequence[str]] = {}
-"""Keywords of each function, by its name."""
 
 
 def checked(function: Callable[P, R], name: str = "") -> Callable[P, R]:
@@ -114,16 +112,14 @@ def checked(function: Callable[P, R], name: str = "") -> Callable[P, R]:
         name: what users call it; by default its name.
     """
     name = name or function.__name__
-    own = KEYWORDS[name] = list(inspect.signature(function).parameters)
+    own = list(inspect.signature(function).parameters)
 
     @wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> R:
         for keyword in kwargs:
             if keyword not in own:
-                others = [other for other, known in KEYWORDS.items() if keyword in known]
-                where = f", which {either(sorted(others))} has" if others else ""
                 hint = meant(keyword, own) or f"choose {', '.join(own) or 'none'}"
-                raise UserError(f"{name} has no keyword `{keyword}`{where}: {hint}".rstrip())
+                raise UserError(f"{name} has no keyword `{keyword}`: {hint}".rstrip())
         return function(*args, **kwargs)
 
     return call
@@ -294,10 +290,7 @@ def _written(
     """Write the page, or the present cases file, and JUnit, where they are wanted."""
     if out is not None:
         page = compared.text or comparison_page(compared)
-        content = page.encode(errors="backslashreplace")
-        if compared.text is not None:
-            check_toml_size(content, out)
-        write_new(out, content)
+        write_new(out, page.encode(errors="backslashreplace"))
     if junit is not None:
         write_junit_of_comparison(junit, compared)
     return compared

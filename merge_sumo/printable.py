@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import shlex
 from collections.abc import Iterable
 from difflib import get_close_matches
@@ -46,21 +45,12 @@ def counted(number: int, what: str) -> str:
 def quoted(argument: str | Path) -> str:
     """Return an argument of a command to paste into a shell.
 
-    What cannot be printed is written as bytes in `$'...'`, which bash, zsh and ksh read.
+    What cannot be printed is escaped as in a sentence, so a shell does not find such a name.
 
     Args:
         argument: the argument.
     """
-    text = str(argument)
-    if text.isprintable():
-        return shlex.quote(text)
-    plain = "".join(
-        letter
-        if letter.isascii() and letter.isprintable() and letter not in "'\\"
-        else "".join(f"\\x{byte:02x}" for byte in os.fsencode(letter))
-        for letter in text
-    )
-    return f"$'{plain}'"
+    return shlex.quote(printable(str(argument)))
 
 
 def either(names: Iterable[str]) -> str:
@@ -73,16 +63,12 @@ def either(names: Iterable[str]) -> str:
     return ordered[0] if len(ordered) == 1 else f"{', '.join(ordered[:-1])} or {ordered[-1]}"
 
 
-def meant(name: str, known: Iterable[str], alike: float = 0.6) -> str:
+def meant(name: str, known: Iterable[str]) -> str:
     """Return "did you mean a or b? " where known names are like a name, else nothing.
 
     Args:
-        name: the name; its case does not matter.
+        name: the name.
         known: the known names.
-        alike: ratio of matching characters that they must have, from 0 to 1.
     """
-    by_folded = {other.casefold(): other for other in known}
-    near = get_close_matches(name.casefold(), by_folded, 3, alike)
-    if not near:
-        return ""
-    return f"did you mean {either([by_folded[folded] for folded in near])}? "
+    near = get_close_matches(name, list(known))
+    return f"did you mean {either(near)}? " if near else ""

@@ -29,7 +29,7 @@ from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.metrics.summary import one_per_case
 from merge_sumo.metrics.timeline import timeline
 from merge_sumo.printable import printable
-from merge_sumo.records import check_toml_size, toml_value
+from merge_sumo.records import toml_value
 from merge_sumo.reports.text import change_in_words
 from merge_sumo.road.loader import centre_lines, road_or_shipped
 from merge_sumo.road.scenario_file import SUFFIX
@@ -146,9 +146,7 @@ def write_cases(run: RecordedCampaign, indices: Sequence[int], target: Path) -> 
     """
     outcomes = [run.outcome(index) for index in dict.fromkeys(indices)] or watching(run)
     path = new_file_in(target, f"cases{SUFFIX}")
-    content = cases_toml(run, outcomes, path, run.settings.vut).encode()
-    check_toml_size(content, path)
-    write_new(path, content)
+    write_new(path, cases_toml(run, outcomes, path, run.settings.vut).encode())
     if not indices and len(outcomes) < len(run.outcomes):
         notice(
             f"note: the file has {len(outcomes)} of {len(run.outcomes):,} cases, chosen to "

@@ -275,7 +275,7 @@ def _check_edge(road_net: RoadNet, name: str) -> None:
     """Raise `UserError` where a net has no such edge, or cars may not drive there."""
     net = road_net.net
     if not net.hasEdge(name) or net.getEdge(name).isSpecial():
-        hint = meant(name, road_net.edges, 0.5)  # ids of edges are short
+        hint = meant(name, road_net.edges)
         raise UserError(f"it has no edge {name}: {hint}name edges of the net")
     if not _lanes(net, name):
         raise UserError(f"no lane of edge {name} is open to cars")
