@@ -118,8 +118,8 @@ def checked(function: Callable[P, R], name: str = "") -> Callable[P, R]:
     def call(*args: P.args, **kwargs: P.kwargs) -> R:
         for keyword in kwargs:
             if keyword not in own:
-                hint = meant(keyword, own) or f"choose {', '.join(own) or 'none'}"
-                raise UserError(f"{name} has no keyword `{keyword}`: {hint}".rstrip())
+                choice = f"{meant(keyword, own)}choose one of {', '.join(own) or 'none'}"
+                raise UserError(f"{name} has no keyword `{keyword}`: {choice}")
         return function(*args, **kwargs)
 
     return call

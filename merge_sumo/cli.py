@@ -32,8 +32,7 @@ from merge_sumo.console import (
 from merge_sumo.errors import UserError
 from merge_sumo.interrupt import Stopped, stopping_in_order
 from merge_sumo.limits import check_limits, exhausted
-from merge_sumo.printable import either, quoted
-from merge_sumo.samplers.registry import SAMPLERS
+from merge_sumo.printable import quoted
 
 if TYPE_CHECKING:
     from cyclopts import ArgumentCollection
@@ -114,9 +113,6 @@ class Commands(App):
             # Conditions may begin with a hyphen, and so may edges of nets of OpenDRIVE and OSM.
             more = Parameter(show_default=shown, allow_leading_hyphen=bool(argument.keys))
             more = Parameter.combine(more, FIELDS.get(name))
-            if name == "sampler":  # installed packages add some
-                text = f"Sampler that proposes the cases: {either(SAMPLERS)}."
-                more = Parameter.combine(more, Parameter(help=text))
             for kind, group in GROUPS.items():
                 if argument.keys and name in kind.__annotations__:
                     more = Parameter.combine(more, Parameter(group=group))

@@ -159,8 +159,8 @@ class _Parser:
 
     def _unknown(self, name: str) -> UserError:
         known = *self._vocabulary, *self._named
-        hint = meant(name, known) or f"choose {', '.join(known)}"
-        return self._error(f"no measure {printable(name)!r} (a text is in quotes): {hint.strip()}")
+        choice = f"{meant(name, known)}choose one of {', '.join(known)}"
+        return self._error(f"no measure {printable(name)!r} (a text is in quotes): {choice}")
 
     def _error(self, why: str, node: ast.expr | None = None) -> UserError:
         shown = printable(ast.unparse(node)[:60]) + " " if node else ""

@@ -149,7 +149,7 @@ def write_cases(run: RecordedCampaign, indices: Sequence[int], target: Path) -> 
     write_new(path, cases_toml(run, outcomes, path, run.settings.vut).encode())
     if not indices and len(outcomes) < len(run.outcomes):
         notice(
-            f"note: the file has {len(outcomes)} of {len(run.outcomes):,} cases, chosen to "
+            f"the file has {len(outcomes)} of {len(run.outcomes):,} cases, chosen to "
             "watch a controller; name others by their index"
         )
     return path

@@ -72,9 +72,9 @@ def test_a_wrong_value_is_one_sentence_and_leaves_nothing(
 @pytest.mark.parametrize(
     ("verb", "keyword", "sentence"),
     [
-        ("probability", "level", "probability has no keyword `level`: choose run, "),
+        ("probability", "level", "probability has no keyword `level`: choose one of run, "),
         ("campaign", "casse", "campaign has no keyword `casse`: did you mean "),
-        ("open_run", "xyz", "`xyz`: choose folder"),
+        ("open_run", "xyz", "`xyz`: choose one of folder"),
     ],
 )
 def test_an_unknown_keyword_is_refused_in_a_sentence(verb, keyword, sentence):

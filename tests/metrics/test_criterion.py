@@ -93,7 +93,7 @@ class TestParsing:
     @pytest.mark.parametrize(
         ("text", "said"),
         [
-            ("speed > 3", "no measure 'speed' (a text is in quotes): choose score, dx_m, "),
+            ("speed > 3", "no measure 'speed' (a text is in quotes): choose one of score, dx_m, "),
             ("tcc_s < 1.5", "'tcc_s' (a text is in quotes): did you mean ttc_s"),
             ("papr", "did you mean paper?"),
             ('end == "TIMEOT"', "never 'TIMEOT': it is MERGED or TIMEOUT"),
