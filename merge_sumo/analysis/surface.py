@@ -6,7 +6,6 @@ It is the surrogate of the sampler `coverage`, learned from the outcomes of any 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -15,7 +14,6 @@ from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.samplers.surrogate import JUDGED_FROM, learn_chance
 from merge_sumo.samplers.uniform import UniformSampler
 from merge_sumo.scenario.case import FloatArray, Pool
-from merge_sumo.workers import number_of_workers
 
 FEWEST_FAILURES = 5
 """Failures at a level from which a surrogate is learned. Chosen, not tuned."""
@@ -55,8 +53,7 @@ def learn_surface(
         tolerated: share of its runs in which a case may fail, 0 to 1.
 
     Returns:
-        The surrogate, which computes on all cores; None where too few cases failed or passed to
-        learn from.
+        The surrogate; None where too few cases failed or passed to learn from.
     """
     at_level = [outcome for outcome in outcomes if outcome.case.level == level]
     if not at_level:
@@ -74,8 +71,8 @@ def learn_surface(
 
     def chance(points: FloatArray) -> FloatArray:
         parts = np.array_split(points, len(points) // PART + 1)
-        # Each part in one thread: the answer is the same whatever the number of cores.
-        with threadpool_limits(1), ThreadPoolExecutor(number_of_workers(None)) as cores:
-            return np.concatenate(list(cores.map(predict, parts)))
+        # In one thread: the answer is the same whatever the number of cores.
+        with threadpool_limits(1):
+            return np.concatenate(list(map(predict, parts)))
 
     return chance

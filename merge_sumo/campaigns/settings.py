@@ -25,7 +25,7 @@ from merge_sumo.printable import printable
 from merge_sumo.records import RecordError, check_fields, to_plain
 from merge_sumo.road.loader import road_for
 from merge_sumo.samplers.base import Predictor, Sampler
-from merge_sumo.samplers.registry import SAMPLERS, make_sampler
+from merge_sumo.samplers.registry import make_sampler
 from merge_sumo.scenario.case import Pool
 from merge_sumo.scenario.scenario import (
     DEADLINE_S,
@@ -94,8 +94,11 @@ class CampaignSettings(SharedSettings):
             if number is not None and number < 1:
                 raise UserError(f"`{name}` is {number}: it must be 1 or more")
         self._check_levels()
-        if self.in_flight is not None:
-            self._check_in_flight()
+        if self.in_flight is not None and self.batch is not None:
+            raise UserError(
+                "a search runs in batches or with cases in flight: leave `in_flight` or `batch` "
+                "away"
+            )
         if self.against is not None:
             self._check_against(self.against)
         if not self.may_vary:  # a case fails in all of its runs or in none
@@ -106,18 +109,6 @@ class CampaignSettings(SharedSettings):
             raise UserError(f"the levels are {list(self.levels)}: name each level once")
         if OWN in self.levels and self.pov is None:
             raise UserError("level own needs a POV of your own: name one as `pov`")
-
-    def _check_in_flight(self) -> None:
-        if self.batch is not None:
-            raise UserError(
-                "a search runs in batches or with cases in flight: leave `in_flight` or `batch` "
-                "away"
-            )
-        if not SAMPLERS[self.sampler].learns:
-            raise UserError(
-                f"`in_flight` is for samplers that learn from outcomes: `sampler` {self.sampler} "
-                "waits for none, and keeps all workers busy without it"
-            )
 
     def _check_against(self, against: str) -> None:
         for name in ("in_flight", "repeat", "tolerated"):
