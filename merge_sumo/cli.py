@@ -16,7 +16,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
-from cyclopts import App, CycloptsError, Group, Parameter, Token, UnusedCliTokensError
+from cyclopts import App, CycloptsError, Group, Parameter, Token
 
 import merge_sumo as ms
 from merge_sumo import config as c
@@ -430,9 +430,6 @@ def execute(words: Sequence[str]) -> int:
     try:
         with notices_printed():
             return app(words) or 0
-    except UnusedCliTokensError as error:
-        unused = " ".join(map(quoted, error.unused_tokens or ()))
-        raise UserError(f"too many arguments: {unused}") from error
     except CycloptsError as error:
         raise UserError(str(error)) from error
     except SystemExit as ended:
