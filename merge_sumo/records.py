@@ -264,16 +264,6 @@ def to_json(value: object, *, indent: int | None = None) -> bytes:
     return (json.dumps(to_plain(value), indent=indent, allow_nan=False) + "\n").encode()
 
 
-def replaced(value: T, **changes: Any) -> T:
-    """Return a record with other values in some fields.
-
-    Args:
-        value: the record.
-        changes: other values by field.
-    """
-    return msgspec.structs.replace(value, **changes)  # type: ignore[type-var]
-
-
 def in_words(hint: Any) -> str:
     """Return the values of a type in words, for "it must be ...".
 

@@ -10,7 +10,7 @@ from itertools import groupby
 from operator import itemgetter
 from typing import Annotated, Any
 
-from msgspec import Meta
+from msgspec import Meta, structs
 
 from merge_sumo.analysis.run_study import RunStudy, StudyFile
 from merge_sumo.campaigns.recorded import RecordedCampaign, failures
@@ -19,7 +19,7 @@ from merge_sumo.controllers.spec import ControllerSpec
 from merge_sumo.errors import UserError
 from merge_sumo.metrics.merge import Severity
 from merge_sumo.metrics.outcome import Episode, Outcome
-from merge_sumo.records import Record, replaced, to_plain
+from merge_sumo.records import Record, to_plain
 from merge_sumo.result import Result
 from merge_sumo.scenario.case import Case
 from merge_sumo.scenario.scenario import Coordinate, level_name
@@ -195,7 +195,7 @@ def explain(
     study.check_same_system()
     found = _Search(study, outcome).explanation(ranges)
     if study.settings.vut != study.run.settings.vut:
-        found = replaced(found, vut=study.settings.vut)
+        found = structs.replace(found, vut=study.settings.vut)
     _write(study.run, found)
     study.on_cases(1)
     return ExplanationResult(study.run, found)
@@ -262,7 +262,7 @@ class _Search:
         for value in (below, above):
             if value is not None:
                 self._reported[trial(axis.name, value)] = True
-        return replaced(axis, below=below, above=above)
+        return structs.replace(axis, below=below, above=above)
 
     def _with_start(self, name: str, value: float) -> Trial:
         changed: dict[str, Any] = {name: value}
