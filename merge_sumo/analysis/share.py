@@ -16,9 +16,10 @@ import numpy as np
 from msgspec import Meta
 
 from merge_sumo.analysis.run_study import RunStudy, StudyFile, end_of
+from merge_sumo.campaigns.recorded import RecordedCampaign
 from merge_sumo.controllers.process import LOG
 from merge_sumo.errors import UserError
-from merge_sumo.metrics.summary import clopper_pearson
+from merge_sumo.metrics.summary import clopper_pearson, summarise
 from merge_sumo.records import Record
 from merge_sumo.scenario.case import Case, from_unit
 from merge_sumo.scenario.scenario import Scenario
@@ -87,11 +88,28 @@ class Shares(Record, frozen=True):
 SHARES = StudyFile("shares.json", Shares)
 
 
+def own_shares(run: RecordedCampaign) -> list[LevelShare]:
+    """Return the share of the cases of a campaign that fail, for each level.
+
+    It is that of all starts where the campaign drew its cases uniformly. An undecided case has no
+    verdict.
+
+    Args:
+        run: the campaign.
+    """
+    shares = []
+    for level, found in summarise(run.outcomes, run.levels, run.tolerated).levels.items():
+        without_verdict = found.cases - found.tested + found.undecided
+        shares.append(LevelShare(level, found.cases, found.failures, without_verdict))
+    return shares
+
+
 def write_shares(study: RunStudy, on_part: Callable[[int, int], None]) -> None:
     """Measure the share that fails at each level of a campaign that has just ended, and write it.
 
-    Nothing is written where uniform cases take long or decide nothing: for drivers that ask SUMO,
-    where a case may fail in some of its runs, and where most cases end as errors.
+    The cases of a campaign that drew them uniformly are counted where further ones take long or
+    decide nothing: for drivers that ask SUMO, where a case may fail in some of its runs, and where
+    most cases end as errors. Of other such campaigns nothing is written.
 
     Args:
         study: the campaign, and how its cases run.
@@ -101,6 +119,8 @@ def write_shares(study: RunStudy, on_part: Callable[[int, int], None]) -> None:
     errors = sum(outcome.measures.end.is_error for outcome in run.outcomes)
     random = run.tolerated or run.scenario.sense.is_random
     if plan.asks_sumo or random or 2 * errors > len(run.outcomes):
+        if run.settings.sampler == "uniform" and not run.settings.stop_when_converged:
+            SHARES.write(run.folder, Shares(tuple(own_shares(run))))
         return
     by_equations = plan.needs_sumo is None
     count = CASES if by_equations else CASES_IN_SUMO

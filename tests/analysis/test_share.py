@@ -95,6 +95,17 @@ def test_of_a_controller_that_errs_says_so_or_is_not_measured():
     assert f"is measured by\n             {command}" in str(run)
 
 
+def test_of_a_campaign_of_uniform_cases_is_that_of_its_own_cases(tmp_path):
+    run = api.campaign(
+        "sumo:IDM", sampler="uniform", level="0", cases=10, out=tmp_path / "run", progress=False
+    )
+    failures = sum(outcome.failed for outcome in run.recorded.outcomes)
+    [level] = SHARES.read(run.folder).levels
+    assert level == LevelShare(level=0, cases=10, failures=failures)
+    assert f"\n0           {level.shown}  " in str(run)
+    assert "is measured by" not in str(run)
+
+
 class Parked:
     """A VUT that stands on the ramp."""
 
