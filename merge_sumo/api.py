@@ -73,7 +73,7 @@ from merge_sumo.interrupt import Stopped
 from merge_sumo.metrics.merge import check_from
 from merge_sumo.metrics.outcome import Outcome
 from merge_sumo.metrics.summary import parse_gates
-from merge_sumo.printable import meant, printable, quoted
+from merge_sumo.printable import either, meant, printable, quoted
 from merge_sumo.records import to_plain
 from merge_sumo.reports import figures
 from merge_sumo.reports.cases_toml import with_file
@@ -102,6 +102,8 @@ __all__ = ["AnyVut", "CampaignRun", "Car", "CaseRun", "Seen", "SeenBatch", "date
 P = ParamSpec("P")
 C = TypeVar("C")
 R = TypeVar("R")
+KEYWORDS: dict[str, Sequence[str]] = {}
+"""Keywords of each function, by its name."""
 
 
 def checked(function: Callable[P, R], name: str = "") -> Callable[P, R]:
@@ -112,14 +114,16 @@ def checked(function: Callable[P, R], name: str = "") -> Callable[P, R]:
         name: what users call it; by default its name.
     """
     name = name or function.__name__
-    own = list(inspect.signature(function).parameters)
+    own = KEYWORDS[name] = list(inspect.signature(function).parameters)
 
     @wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> R:
         for keyword in kwargs:
             if keyword not in own:
                 choice = f"{meant(keyword, own)}choose one of {', '.join(own) or 'none'}"
-                raise UserError(f"{name} has no keyword `{keyword}`: {choice}")
+                others = [other for other, known in KEYWORDS.items() if keyword in known]
+                where = f", which {either(others)} has" if others else ""
+                raise UserError(f"{name} has no keyword `{keyword}`{where}: {choice}")
         return function(*args, **kwargs)
 
     return call

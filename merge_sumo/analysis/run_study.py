@@ -15,7 +15,6 @@ from merge_sumo.files import check_generated, files_now, replace_own
 from merge_sumo.metrics.outcome import Episode
 from merge_sumo.printable import printable
 from merge_sumo.records import Record, read_indexed, read_record, to_json
-from merge_sumo.road.loader import EARLIER_DRAWINGS
 from merge_sumo.scenario.case import Case
 from merge_sumo.scenario.scenario import level_name
 from merge_sumo.simulation.evaluate import evaluate
@@ -187,7 +186,7 @@ class RunStudy:
             UserError: where the campaign had another net or other POVs.
         """
         run, road, now = self.run, self.plan.road, self.settings.to_record(self.plan)
-        if run.settings.net_sha256 not in (None, road.sha256, *EARLIER_DRAWINGS):
+        if run.settings.net_sha256 not in (None, road.sha256):
             raise UserError(
                 f"{run.folder} was run on another net than {road.path} is now: put that back"
             )

@@ -124,8 +124,8 @@ def timeline(
     if trajectory is not None:
         whole = trajectory.whole
         if outcome.failed:
-            kind = _kind(outcome, trajectory, last, rule)
-            whole = whole[: _row(last) + 1]
+            whole = whole[: round(last.time_s / DT_S) + 1]
+            kind = _kind(outcome, trajectory, whole, last, rule)
         events += _phases(outcome, whole, {end.car for end in ends})
     events.sort(key=lambda event: event.time_s)
     result = found.result if found.end.is_error else found.result.lower()
@@ -223,8 +223,8 @@ def _ends(
     if trajectory is None:
         return
     hardest_mps2 = found.after_brake_mps2
-    is_told = rule != PAPER and (rule or found.severity == Severity.HARSH)
-    if hardest_mps2 and contact_s is None and is_told:
+    is_after_m = rule != PAPER and (rule or found.severity == Severity.HARSH)
+    if hardest_mps2 and contact_s is None and is_after_m:
         a_mps2 = trajectory.whole[len(trajectory.motion) - 1 :, :, 2]
         row, index = divmod(int(np.abs(a_mps2 + hardest_mps2).argmin()), len(a_mps2[0]))
         row += len(trajectory.motion) - 1
@@ -245,28 +245,33 @@ def _must_brake(trajectory: Trajectory) -> str:
     needed_mps2 = brakes_needed_mps2(trajectory)
     at_m = trajectory.motion[-1]
     car = np.delete(np.arange(len(at_m)), VUT)[needed_mps2.argmax()]
-    behind = car if at_m[car, 0] < at_m[VUT, 0] else VUT
+    name = NAMES[VEHICLES[car if at_m[car, 0] < at_m[VUT, 0] else VUT]]
     if np.isinf(needed_mps2).any():
-        return f"the {NAMES[VEHICLES[behind]]} is too near to brake"
-    return f"the {NAMES[VEHICLES[behind]]} has to brake at -{needed_mps2.max():.1f} m/s2"
+        return f"the {name} is too near to brake"
+    return f"the {name} has to brake at -{needed_mps2.max():.1f} m/s2"
 
 
-def _kind(outcome: Outcome, trajectory: Trajectory, last: Event, rule: str | None) -> str:
-    """Return the kind of a failure by the speeds before its last event."""
-    found, row = outcome.measures, _row(last)
+def _kind(
+    outcome: Outcome, trajectory: Trajectory, motion: FloatArray, last: Event, rule: str | None
+) -> str:
+    """Return the kind of a failure by the motion up to its last event."""
+    found, now = outcome.measures, motion[-1]
     if found.end is not End.MERGED:
         return "did not arrive"
     if rule is None:
         return "rule broken"
-    now = trajectory.whole[row]
-    car = trajectory.nearest_at(row) if last.car == VEHICLES[VUT] else VEHICLES.index(last.car)
+    car = (
+        trajectory.nearest_at(len(motion) - 1)
+        if last.car == VEHICLES[VUT]
+        else VEHICLES.index(last.car)
+    )
     is_after = last.time_s >= found.t_end_s and not found.is_close
     if is_after and now[car, 0] < now[VUT, 0]:
         return "cut in"
-    vut, other = (_trend(trajectory.whole[: row + 1, who, 1]) for who in (VUT, car))
+    vut, other = (_trend(motion[:, who, 1]) for who in (VUT, car))
     if vut >= 0.0:
         return "both accelerate" if vut > 0.0 and other > 0.0 else "squeeze"
-    v_mps, way_out_s = trajectory.whole[: row + 1, VUT, 1], found.last_avoidable_s
+    v_mps, way_out_s = motion[:, VUT, 1], found.last_avoidable_s
     begun_s = [_time_s(a) for a, b in phases(v_mps) if v_mps[b] < v_mps[a]]
     if found.is_close and begun_s and (way_out_s is None or begun_s[-1] > way_out_s):
         return "late brake"
@@ -282,7 +287,3 @@ def _trend(v_mps: FloatArray) -> float:
 
 def _time_s(row: int) -> float:
     return round(row * DT_S, 1)
-
-
-def _row(event: Event) -> int:
-    return round(event.time_s / DT_S)

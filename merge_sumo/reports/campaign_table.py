@@ -21,7 +21,6 @@ from merge_sumo.reports.facts import (
     FAILURES,
     KIND,
     PROBABILITY_TO_FAIL,
-    REPEATED,
     RULE,
     STARTS_THAT_FAIL,
     TIMEOUTS,
@@ -36,7 +35,7 @@ from merge_sumo.scenario.scenario import level_name
 LINE_CHARACTERS = 105
 """Longest first line with the rule; the rule of a longer one is a line of its own."""
 LABEL_CHARACTERS = 13
-TEXT_CHARACTERS = 100 - LABEL_CHARACTERS
+TEXT_CHARACTERS = 87
 COLUMNS = (
     "POV level",
     "all starts that fail   ",  # as wide as the widest usual cell
@@ -124,8 +123,6 @@ def _remarks(
     if not has_shares and PROBABILITY_TO_FAIL not in of:
         measure = campaign_command("probability", run.folder, run.record)
         yield "Not known:", ["the share of all starts that fail, which is measured by", measure]
-    if REPEATED in of:
-        yield "Repeated:", [f"{_counted(of[REPEATED], 'case')} ran more than once"]
     if AT_MOST in of:
         yield "Converged:", [f"before {of[AT_MOST].shown} cases, as little new was found"]
     if AVOIDED_BY_POV in of:

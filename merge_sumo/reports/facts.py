@@ -42,7 +42,6 @@ FAILURES = "failures"
 UNDECIDED = "undecided"
 CONTACT = "cases with contact that are not failures"
 STARTS_THAT_FAIL = "starts that fail"
-REPEATED = "cases that ran more than once"
 DRIVEN = "failures that reference drivers drove"
 AVOIDED = "failures that driver {} avoids"
 AVOIDED_BY_POV = "failures that a careful POV avoids"
@@ -203,7 +202,7 @@ def _repeats(run: RecordedCampaign) -> Facts:
     repeated = [case for case in cases if case.runs > 1]
     if run.tolerated or repeated:
         yield Fact("runs", sum(case.runs for case in cases), "draw")
-        yield Fact(REPEATED, len(repeated), "draw")
+        yield Fact("cases that ran more than once", len(repeated), "draw")
         both = sum(0 < case.failures < case.runs for case in repeated)
         yield Fact("of these, cases that both fail and pass", both, "draw")
     if run.tolerated:

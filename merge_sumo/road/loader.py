@@ -17,8 +17,6 @@ from merge_sumo.road.road import Road
 from merge_sumo.road.xml_input import read_xml
 from merge_sumo.scenario.scenario import ROOM_AFTER_M, US23, Bounds, Scenario
 
-EARLIER_DRAWINGS = ("92c2d19674fa126cca32f9105d7a6eee06942102d3906a76992e2705dab533a2",)
-"""Hashes of nets of the package that were drawn otherwise: their lanes had today's lengths."""
 _found: dict[tuple[object, ...], Road] = {}
 
 

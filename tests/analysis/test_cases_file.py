@@ -21,7 +21,6 @@ from merge_sumo.metrics.measures import Measures
 from merge_sumo.metrics.merge import Severity
 from merge_sumo.reports.cases_toml import write_cases
 from merge_sumo.reports.text import comparison_summary
-from merge_sumo.road.loader import EARLIER_DRAWINGS, road_for
 from merge_sumo.road.scenario_file import named_scenario, shipped_scenarios
 from merge_sumo.scenario.scenario import US23
 from merge_sumo.scenario.trajectory import End
@@ -83,11 +82,6 @@ def test_a_changed_controller_is_caught_and_the_same_one_changes_nothing(file):
     assert same.text == file.read_text()
     assert not same.worse
     assert ms.rerun(file, vut="design2?gap_m=12").worse
-
-
-def test_a_file_from_an_earlier_drawing_of_the_shipped_road_still_runs(file):
-    edit(file, road_for(US23).sha256, EARLIER_DRAWINGS[0])
-    assert not ms.rerun(file).worse
 
 
 def test_a_controller_of_the_user_is_run_by_its_host(command_line, tmp_path, monkeypatch):

@@ -72,12 +72,12 @@ def test_a_wrong_value_is_one_sentence_and_leaves_nothing(
 @pytest.mark.parametrize(
     ("verb", "keyword", "sentence"),
     [
-        ("probability", "level", "probability has no keyword `level`: choose one of run, "),
+        ("probability", "level", "`level`, which campaign, resume, run, rerun, truth"),
         ("campaign", "casse", "campaign has no keyword `casse`: did you mean "),
         ("open_run", "xyz", "`xyz`: choose one of folder"),
     ],
 )
-def test_an_unknown_keyword_is_refused_in_a_sentence(verb, keyword, sentence):
+def test_a_keyword_of_another_function_is_refused_with_who_has_it(verb, keyword, sentence):
     with pytest.raises(UserError) as refused:
         getattr(ms, verb)("run", **{keyword: 1})
     assert sentence in str(refused.value)
