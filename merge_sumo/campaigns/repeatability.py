@@ -12,6 +12,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from functools import partial
 from typing import Final
 
 import numpy as np
@@ -25,7 +26,7 @@ from merge_sumo.printable import counted
 from merge_sumo.records import Record, read_indexed, to_json
 from merge_sumo.scenario.scenario import DT_S, OWN, EpisodeTime
 from merge_sumo.scenario.trajectory import End, Trajectory
-from merge_sumo.simulation.evaluate import evaluate, with_measures
+from merge_sumo.simulation.evaluate import lost_episode, simulate_part, with_measures
 from merge_sumo.simulation.plan import SimulationPlan
 from merge_sumo.workers import Workers
 
@@ -77,8 +78,10 @@ def check_repeatability(
         return
     second_runs = []
     cases = [outcome.case for outcome in outcomes]
-    episodes = evaluate(plan, cases, workers, with_measures)
-    for outcome, episode in zip(outcomes, episodes, strict=True):
+    job = workers.submit(
+        partial(simulate_part, plan, keep=with_measures), cases, partial(lost_episode, plan)
+    )
+    for outcome, episode in zip(outcomes, workers.collect(job), strict=True):
         if not episode.outcome.measures.end.is_error:  # of a slow machine, perhaps
             second_runs.append(second_run_of(outcome, run.trajectory(outcome.index), episode))
     second_runs.sort(key=lambda second: second.index)

@@ -24,7 +24,6 @@ from merge_sumo.reports.facts import (
     RULE,
     STARTS_THAT_FAIL,
     TIMEOUTS,
-    UNDECIDED,
     VUT,
     WORST,
     Fact,
@@ -45,7 +44,6 @@ COLUMNS = (
     "regions",
     "FMC",
 )
-SMALL_FMC = 0.001
 
 
 def campaign_lines(run: RecordedCampaign, summary: Summary, facts: Sequence[Fact]) -> list[str]:
@@ -67,8 +65,6 @@ def campaign_lines(run: RecordedCampaign, summary: Summary, facts: Sequence[Fact
     found = [_counted(of[name], thing) for name, thing in things.items() if name in of]
     if not summary.tested:
         found.append("nothing tested")
-    if summary.undecided:
-        found.append(f"{of[UNDECIDED].shown} undecided")
     head = f"{of[VUT].shown} on {run.scenario.name}: {', '.join(found)}"
     rule = f"({of[RULE].shown})"
     is_short = len(head) + len(rule) < LINE_CHARACTERS
@@ -103,7 +99,7 @@ def level_table(summary: Summary, shares: Mapping[int | None, str]) -> list[list
     rows = [list(COLUMNS)]
     for level, of in summary.levels.items():
         found = f"{of.failures:,}" if of.tested else "nothing tested" if of.cases else "not run"
-        coverage = f"{of.fmc:.3f}".removeprefix("0") if of.fmc >= SMALL_FMC else "< .001"
+        coverage = f"{of.fmc:.3f}".removeprefix("0") if of.fmc >= 0.001 else "< .001"
         row = [level_name(level), shares.get(level, ""), found]
         for number in (of.undecided, of.cases - of.tested, of.regions):
             row.append(f"{number:,}" if number else "")

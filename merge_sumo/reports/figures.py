@@ -327,8 +327,7 @@ def draw_map(cases: Sequence[Outcome], dims: Dims, axes: Axes | None = None) -> 
         judged = [one.case for one in cases if verdict_of(one) == verdict]
         if judged:
             places = np.array([[d.of(case) for d in dims[:2]] for case in judged])
-            label = f"{len(judged)} {verdict}"
-            axes.scatter(places[:, 0], places[:, 1], s=12, color=ink, label=label)
+            axes.scatter(*places.T, s=12, color=ink, label=f"{len(judged)} {verdict}")
             if verdict == "fail" and len(dims) <= 3:
                 _balls(axes, places, dims, ink)
     _pool_axes(axes, dims)
