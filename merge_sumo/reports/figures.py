@@ -327,7 +327,8 @@ def draw_map(cases: Sequence[Outcome], dims: Dims, axes: Axes | None = None) -> 
         judged = [one.case for one in cases if verdict_of(one) == verdict]
         if judged:
             places = np.array([[d.of(case) for d in dims[:2]] for case in judged])
-            axes.scatter(*places.T, s=12, color=ink, label=f"{len(judged)} {verdict}")
+            x, y = places.T
+            axes.scatter(x, y, s=12, color=ink, label=f"{len(judged)} {verdict}")
             if verdict == "fail" and len(dims) <= 3:
                 _balls(axes, places, dims, ink)
     _pool_axes(axes, dims)

@@ -21,7 +21,7 @@ class TestTheCommand:
         head, *said = [line.strip() for line in out.splitlines()[:8]]
         assert head.startswith("case: late brake, contact at ")
         assert "7.7 s   last way out: full braking or full acceleration" in said
-        assert "8.1 s   the VUT brakes: 20.3 to 14.1 m/s, 0.4 s too late" in said
+        assert "8.1 s   the VUT brakes: 20.3 to 16.5 m/s, 0.4 s too late" in said
         assert "impact speed" in out
 
     def test_keeps_the_case_as_a_folder_that_replays(self, command_line, tmp_path):
