@@ -32,7 +32,8 @@ from merge_sumo.console import (
 from merge_sumo.errors import UserError
 from merge_sumo.interrupt import Stopped, stopping_in_order
 from merge_sumo.limits import check_limits, exhausted
-from merge_sumo.printable import quoted
+from merge_sumo.printable import either, quoted
+from merge_sumo.samplers.registry import SAMPLERS
 
 if TYPE_CHECKING:
     from cyclopts import ArgumentCollection
@@ -62,6 +63,7 @@ GROUPS: Mapping[type[Any], Group] = {
 """Groups of options in help, by the class that declares the field."""
 FIELDS: Mapping[str, Parameter] = {
     "progress": Parameter(negative=("--quiet", "-q")),
+    "sampler": Parameter(help=f"Sampler that proposes the cases: {either(SAMPLERS)}."),
     "workers": Parameter(show_default=False),
 }
 """What else an option is, by the name of its field."""

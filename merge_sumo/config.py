@@ -140,8 +140,7 @@ class Search:
     """Which cases run."""
 
     sampler: str = "coverage"
-    """Sampler that proposes the cases: coverage, gpr, subset, annealing, uniform, or an installed
-    one."""
+    """Sampler that proposes the cases: coverage, gpr, subset, annealing or uniform."""
     cases: int | None = None
     """Number of cases; by default until the search has converged, at most 800."""
     batch: int | None = None

@@ -242,13 +242,12 @@ def _ends(
 
 def _must_brake(trajectory: Trajectory) -> str:
     """Return which vehicle has to brake most after the merge, and how hard."""
-    needed_mps2 = brakes_needed_mps2(trajectory)
-    at_m = trajectory.motion[-1]
-    car = np.delete(np.arange(len(at_m)), VUT)[needed_mps2.argmax()]
+    needed_mps2 = np.insert(brakes_needed_mps2(trajectory), VUT, 0.0)
+    at_m, car = trajectory.motion[-1], needed_mps2.argmax()
     name = NAMES[VEHICLES[car if at_m[car, 0] < at_m[VUT, 0] else VUT]]
-    if np.isinf(needed_mps2).any():
+    if np.isinf(needed_mps2[car]):
         return f"the {name} is too near to brake"
-    return f"the {name} has to brake at -{needed_mps2.max():.1f} m/s2"
+    return f"the {name} has to brake at -{needed_mps2[car]:.1f} m/s2"
 
 
 def _kind(

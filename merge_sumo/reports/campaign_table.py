@@ -31,10 +31,7 @@ from merge_sumo.reports.facts import (
 from merge_sumo.reports.text import aligned
 from merge_sumo.scenario.scenario import level_name
 
-LINE_CHARACTERS = 105
-"""Longest first line with the rule; the rule of a longer one is a line of its own."""
 LABEL_CHARACTERS = 13
-TEXT_CHARACTERS = 87
 COLUMNS = (
     "POV level",
     "all starts that fail   ",  # as wide as the widest usual cell
@@ -67,7 +64,7 @@ def campaign_lines(run: RecordedCampaign, summary: Summary, facts: Sequence[Fact
         found.append("nothing tested")
     head = f"{of[VUT].shown} on {run.scenario.name}: {', '.join(found)}"
     rule = f"({of[RULE].shown})"
-    is_short = len(head) + len(rule) < LINE_CHARACTERS
+    is_short = len(head) + len(rule) < 105  # else the rule is a line of its own
     lines = [f"{head} {rule}", ""] if is_short else [head, rule, ""]
     shares = {fact.level: fact.shown for fact in facts if fact.name == STARTS_THAT_FAIL}
     if summary.levels:
@@ -114,15 +111,15 @@ def _remarks(
     """Yield labels, and the lines behind each."""
     yield "Not judged:", [line.strip() for line in summary.error_lines()]
     if CONTACT in of:
-        contacts = f"{_counted(of[CONTACT], 'case')} with contact"
-        yield "Not counted:", [f"{contacts} (`fail_when` unsafe counts them)"]
+        cases = _counted(of[CONTACT], "case")
+        yield "Not counted:", [f"{cases} with contact (`fail_when` unsafe counts them)"]
     if not has_shares and PROBABILITY_TO_FAIL not in of:
         measure = campaign_command("probability", run.folder, run.record)
         yield "Not known:", ["the share of all starts that fail, which is measured by", measure]
     if AT_MOST in of:
         yield "Converged:", [f"before {of[AT_MOST].shown} cases, as little new was found"]
     if AVOIDED_BY_POV in of:
-        yield "Avoidable:", textwrap.wrap(_avoidable(of), TEXT_CHARACTERS)
+        yield "Avoidable:", textwrap.wrap(_avoidable(of), 87)
     if WORST in of:
         replay = command("replay", run.folder, of[WORST].value, gui=True)
         yield "Worst:", [f"case {of[WORST].value}, {of[KIND].shown}", replay]

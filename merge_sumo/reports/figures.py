@@ -332,7 +332,7 @@ def draw_map(cases: Sequence[Outcome], dims: Dims, axes: Axes | None = None) -> 
             if verdict == "fail" and len(dims) <= 3:
                 _balls(axes, places, dims, ink)
     _pool_axes(axes, dims)
-    axes.legend(loc="upper left", bbox_to_anchor=(0.0, -0.15), ncols=4, frameon=False)
+    axes.legend(loc="upper left", bbox_to_anchor=(0.0, -0.15), ncols=4)
     return axes
 
 
@@ -372,10 +372,10 @@ def draw_case(trajectory: Trajectory, told: Timeline, axes: Axes | None = None) 
     below = ["time, s"]
     for event in told.events:
         below.append(f"{event.time_s:.1f} s  {event.text}")
-        axes.axvline(event.time_s, color="gray", lw=0.8, ls=":")
+        axes.axvline(event.time_s, color="gray", ls=":")
     axes.set_xlabel("\n".join(below), loc="left", fontsize="small")
     axes.set(ylabel=X_AXIS, title=told.result)
-    axes.legend(frameon=False)
+    axes.legend()
     return axes
 
 
