@@ -112,9 +112,9 @@ def timeline(
         others: further events, such as the last moment for another driver.
 
     Example:
-        >>> case = ms.run(vut="design1", level=0, x_pov0_m=-290, v_pov0_mps=34)
+        >>> case = ms.run(vut="design1", level=0, x_pov0_m=-285, v_pov0_mps=33)
         >>> timeline(case.outcome, case.trajectory, None).events[-1].text
-        'the VUT reaches the merge point 2.6 m ahead of the POV: contact at 8.2 m/s'
+        'the VUT reaches the merge point 4.8 m behind the POV: contact at 16.7 m/s'
     """
     found, rule, kind, met = outcome.measures, _rule(outcome), None, NONE_MET
     if trajectory is not None and found.impact_speed_mps is not None:
@@ -223,8 +223,8 @@ def _ends(
     if trajectory is None:
         return
     hardest_mps2 = found.after_brake_mps2
-    is_after_m = rule != PAPER and (rule or found.severity == Severity.HARSH)
-    if hardest_mps2 and contact_s is None and is_after_m:
+    breaks_later = rule != PAPER and (rule or found.severity == Severity.HARSH)
+    if hardest_mps2 and contact_s is None and breaks_later:
         a_mps2 = trajectory.whole[len(trajectory.motion) - 1 :, :, 2]
         row, index = divmod(int(np.abs(a_mps2 + hardest_mps2).argmin()), len(a_mps2[0]))
         row += len(trajectory.motion) - 1
