@@ -3,7 +3,7 @@
 python examples/merging_agent.py runs/agent.zip
 merge-sumo campaign --vut examples/merging_agent.py:Agent --level 0
 
-`docs/tutorials/reinforcement-learning.md` explains it.
+`docs/how-to/reinforcement-learning.md` explains it.
 """
 
 from __future__ import annotations

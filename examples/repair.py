@@ -3,7 +3,7 @@
 python examples/repair.py runs/repaired
 
 Write your controller, its parameters and your scenario into the constants below.
-`docs/tutorials/repair.md` explains it.
+`docs/how-to/repair.md` explains it.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Write the files and the script of docs/tutorials/ci.md for the CI of a controller.
+"""Write the files and the script of docs/how-to/ci.md for the CI of a controller.
 
 python tools/ci_snippets.py github FOLDER    the commands of the GitHub workflow, one per line
 python tools/ci_snippets.py gitlab FOLDER    those of the GitLab job
@@ -17,7 +17,7 @@ from typing import Any
 
 import yaml
 
-PAGE = Path(__file__).resolve().parent.parent / "docs" / "tutorials" / "ci.md"
+PAGE = Path(__file__).resolve().parent.parent / "docs" / "how-to" / "ci.md"
 TITLED = re.compile(r'^```\w+ title="([^"]+)"\n(.*?)^```$', re.MULTILINE | re.DOTALL)
 GITHUB, GITLAB = ".github/workflows/merge.yml", ".gitlab-ci.yml"
 

@@ -5,7 +5,7 @@
   ones up to `--cases`, and the criterion of the campaign judges them next to SUMO.
 
 For campaigns of a VUT of this package. Needs the extra `peers`. Exit code 1 where vehicles with the
-same commands move differently there; docs/explanations/other-simulators.md has the results.
+same commands move differently there; docs/how-to/other-simulators.md has the results.
 
 HighwayEnv (Leurent, 2018) moves a vehicle that does not steer by x + v dt and v + a dt, which is
 eq. (4). Each vehicle of an episode has a straight lane of its own there, along which it drives its

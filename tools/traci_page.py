@@ -47,7 +47,7 @@ controller changes its lane ([Lane changes](../tutorials/traci-controller.md#lan
 before SUMO's speed. `getParameter("vut", "seed")` is the seed of the case. Other commands are \
 accepted without effect (the last lines of a campaign name those that could move a vehicle in \
 SUMO), or refused with a reason, as an error of that command; \
-the connection stays open. [Why SUMO decides](../decisions/traci-server.md).
+the connection stays open. [Why SUMO decides](../explanation/decisions/traci-server.md).
 """
 
 

@@ -33,7 +33,7 @@ from merge_sumo.metrics.fmc import RADIUS, fmc
 from merge_sumo.testing import SamplerContract
 
 ROOT = Path(__file__).resolve().parents[2]
-PAGE = (ROOT / "docs" / "explanations" / "benchmark.md").read_text(encoding="utf-8")
+PAGE = (ROOT / "docs" / "explanation" / "benchmark.md").read_text(encoding="utf-8")
 DISC = pi * RADIUS**2
 FOUR = [(0.2, 0.2), (0.2, 0.8), (0.8, 0.2), (0.8, 0.8)]
 """Failures whose discs do not overlap."""

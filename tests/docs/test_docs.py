@@ -52,7 +52,7 @@ def test_pages_of_the_reference_are_those_of_the_code(page):
 
 
 class TestTheArchitecture:
-    PAGE = text_of("docs/explanations/architecture.md")
+    PAGE = text_of("docs/explanation/architecture.md")
 
     def test_lists_the_rooms_in_the_order_of_imports(self):
         rooms = re.findall(r"^\| `(\w+)/`", self.PAGE, re.MULTILINE)

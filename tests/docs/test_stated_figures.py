@@ -61,7 +61,7 @@ class TestTruths:
         first, second, third = (figures(*one)[1] for one in of)
         row = f" | {first} (.1296) | {second} (.0849) | {third} (.0073) |"
         assert row in page("README.md")
-        assert row in page("docs/explanations/paper.md")
+        assert row in page("docs/explanation/paper.md")
 
     @pytest.mark.parametrize("vut", ["design1", "design2"])
     @pytest.mark.parametrize(("level", "cases"), [(0, 10_000), (1, 10_000), (2, 20_000)])
@@ -79,7 +79,7 @@ class TestTruths:
         row = f"| level {level} | {cases:,} | {failures} | {fmc} | {len(sizes)} |"
         assert row in page(ROUNDABOUT)
         share = ("none of 10,000 uniform", f"{failures}, all", f"{failures} of 20,000")[level]
-        assert f"at level {level} in {share}" in page("docs/explanations/scenarios.md")
+        assert f"at level {level} in {share}" in page("docs/how-to/scenarios.md")
 
 
 @pytest.mark.parametrize("library", LIBRARIES, ids=["default", "human", "roundabout"])

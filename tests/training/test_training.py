@@ -76,7 +76,7 @@ class TestEnvironments:
 
 def test_the_tutorial_shows_the_code_that_its_commands_run():
     root = Path(__file__).parents[2]
-    page = (root / "docs/tutorials/reinforcement-learning.md").read_text(encoding="utf-8")
+    page = (root / "docs/how-to/reinforcement-learning.md").read_text(encoding="utf-8")
     code = (root / "examples/merging_agent.py").read_text(encoding="utf-8")
     first, *blocks = re.findall(r"```python\n(.*?)```", page, flags=re.DOTALL)
     assert "make_vec" in first
