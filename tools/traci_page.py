@@ -48,6 +48,81 @@ before SUMO's speed. `getParameter("vut", "seed")` is the seed of the case. Othe
 accepted without effect (the last lines of a campaign name those that could move a vehicle in \
 SUMO), or refused with a reason, as an error of that command; \
 the connection stays open. [Why SUMO decides](../explanation/decisions/traci-server.md).
+
+## Start, end and connection
+
+- `--vut "traci:COMMAND {port}"` starts the program, starts it again if it ends, and stops it \
+at the end. The port replaces `{port}`, and is in the environment variable `MERGE_SUMO_PORT`. A program \
+that calls `traci.start(...)` passes this port on (`port=...`).
+- `--vut traci` waits for a program that you start, on 127.0.0.1:8813. `--vut traci:9000` waits on \
+another port.
+- The program can run for one episode, for several or for all. It can keep one connection or open \
+a new one for each episode. merge-sumo serves one client at a time.
+- In every episode the vehicles `pov` and `vut` depart. They arrive when the episode ends, or at \
+the end of the net. The road is then empty for one step.
+- SUMO opens no port. The only port of a campaign is on the loopback interface. On Linux it \
+serves only connections of your user ([the rules, also for other systems]\
+(../../SECURITY.md#the-traci-port)). The program can run elsewhere, for example in a container that shares the network, as the same \
+user.
+- If the program ends and a process that it started keeps the connection open, every case ends as \
+an error.
+
+## Commands that move the VUT
+
+- `setSpeed` acts in the next step and holds until `setSpeed(-1)`.
+- `setSpeed`, `slowDown` and `setAcceleration` set the speed. When `slowDown` or `setAcceleration` \
+has ended, and after `setSpeed(-1)`, the car-following model of SUMO drives the VUT.
+- `setSpeedMode(31)`, `setTau`, `openGap`, `setStop` and other commands act as in SUMO.
+- `sigma` is 0, so that episodes do not depend on each other. `setImperfection` changes `sigma`, \
+and episodes then depend on each other.
+- Without an acceleration lane, lane changes have no effect. `changeSublane`, reroutes, colours \
+and shapes, views, and keys of `setParameter` with a dot have no effect on any road. The scenario \
+sets the path. If such a command could move a vehicle in SUMO, the last lines of a campaign name \
+it, with the number of cases in which the controller gave it.
+- `setParameter` stores keys without a dot.
+- `moveTo`, `remove`, `saveState` and similar commands are refused. The connection stays open.
+
+## A vehicle model of the controller
+
+- `setPreviousSpeed` sets the speed of `vut` after the next step. It overrides all other commands, \
+in any order, for this step only. In a step without it, a commanded speed acts; without a \
+commanded speed, `vut` keeps its speed. In a long `simulationStep(time)` it holds for all steps.
+- `moveToXY` sets the position of the front bumper after the next step. merge-sumo derives the \
+speed: the way along the lane from the point of the previous step, divided by 0.1 s. The first \
+point counts from the position of `vut`. `getPosition` then returns the point, as in SUMO.
+- With `moveToXY`, `vut` has the new speed only from the end of the step on (eq. (4)). It is \
+therefore a little before or after the point: by 0.1 s times the speed gained since the first \
+point, and after a clipped step by the clipped distance. `getLanePosition`, gaps and verdicts use \
+the position of `vut`.
+- With `setPreviousSpeed` and `moveToXY` in the same step, the point changes only the answer of \
+`getPosition`.
+- `moveToXY` accepts points up to 2 m from the lane, and refuses others. Edge, lane, angle, \
+`keepRoute` and `matchThreshold` have no effect. Next to an acceleration lane the nearer lane \
+counts: a model that crosses over merges.
+- The limits of the scenario clip the speed. `clipped_steps` counts clipped steps up to M, and \
+`getSpeed` returns the driven speed, from which a model must continue. A negative speed is \
+refused. A speed that is not a number ends the case as an error.
+- `getSpeed` returns the driven speed. In SUMO such a loop reads there the speed that the driver \
+of SUMO chose. Here `getSpeedWithoutTraCI` returns the speed that SUMO chose in the last step \
+(after `setSpeed("vut", -1)`).
+- Leave out `--act`, which adds its own delay and lag. A model with a first-order lag of 0.3 s \
+drives as the law without the model and with `--act lag_s=0.3`, to 1e-6 m (`pytest \
+tests/controllers/test_traci_commands.py -k VehicleModel`).
+
+## Lane changes
+
+- Edges and lanes are those of the net file. In `us23-lane`, both lanes are on the edge `lane`, \
+and lane 0 is the acceleration lane. `getLanePosition`, `getNeighbors`, `getLeftFollowers`, \
+`couldChangeLane` and similar functions use these lanes.
+- `vut` departs in lane change mode 0: only the controller changes its lane. `changeLane` and \
+`changeLaneRelative` act in the next step, whatever drives on the other lane. A controller that \
+never changes lanes drives to the end of the lane. There the VUT is moved or stopped, as the \
+scenario sets it.
+- `setLaneChangeMode` acts as in SUMO. In mode 512 SUMO refuses a change into a gap that it \
+considers unsafe. In mode 1621, the default of SUMO, the lane-change model merges by itself. It \
+adapts the speed only after `setSpeed("vut", -1)`. The car-following model then stops before the \
+end of the lane until the VUT can merge.
+- The merge is final: a later lane change of `vut` is undone.
 """
 
 
