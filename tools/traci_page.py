@@ -52,8 +52,8 @@ the connection stays open. [Why SUMO decides](../explanation/decisions/traci-ser
 ## Start, end and connection
 
 - `--vut "traci:COMMAND {port}"` starts the program, starts it again if it ends, and stops it \
-at the end. The port replaces `{port}`, and is in the environment variable `MERGE_SUMO_PORT`. A program \
-that calls `traci.start(...)` passes this port on (`port=...`).
+at the end. The port replaces `{port}`, and is in the environment variable \
+`MERGE_SUMO_PORT`. A program that calls `traci.start(...)` passes this port on (`port=...`).
 - `--vut traci` waits for a program that you start, on 127.0.0.1:8813. `--vut traci:9000` waits on \
 another port.
 - The program can run for one episode, for several or for all. It can keep one connection or open \
@@ -62,8 +62,8 @@ a new one for each episode. merge-sumo serves one client at a time.
 the end of the net. The road is then empty for one step.
 - SUMO opens no port. The only port of a campaign is on the loopback interface. On Linux it \
 serves only connections of your user ([the rules, also for other systems]\
-(../../SECURITY.md#the-traci-port)). The program can run elsewhere, for example in a container that shares the network, as the same \
-user.
+(../../SECURITY.md#the-traci-port)). The program can run elsewhere, for example in a \
+container that shares the network, as the same user.
 - If the program ends and a process that it started keeps the connection open, every case ends as \
 an error.
 
