@@ -1,11 +1,11 @@
-"""Print the commands of the site and of README, one per line: CI runs them.
+"""Print the commands of the site, of README and of CONTRIBUTING, one per line: CI runs them.
 
 python tools/readme_commands.py            all commands in ```sh blocks, in order
 python tools/readme_commands.py "Install"  only those under that heading
 
-The pages come in the order of the site's navigation (`mkdocs.yml`), then README, which ends with
-the tests. A ```bash block is for what CI cannot run as it stands: the start page's are a test
-(`tests/docs/test_tutorials.py`).
+The pages come in the order of the site's navigation (`mkdocs.yml`), then README, then
+CONTRIBUTING, which runs the tests. A ```bash block is for commands that CI cannot run as they are:
+`tests/docs/test_tutorials.py` runs those of the start page.
 """
 
 from __future__ import annotations
@@ -15,14 +15,14 @@ import sys
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
-README = ROOT / "README.md"
+LAST = (ROOT / "README.md", ROOT / "CONTRIBUTING.md")
 
 
 def pages() -> list[Path]:
-    """Return the pages of the site that docs/ holds, in the order of the navigation, and README."""
+    """Return the pages in docs/ in the order of the navigation, then README and CONTRIBUTING."""
     _, nav = (ROOT / "mkdocs.yml").read_text(encoding="utf-8").split("\nnav:\n")
     named = [ROOT / "docs" / name for name in re.findall(r"[\w/-]+\.md", nav)]
-    return [*(page for page in named if page.is_file()), README]
+    return [*(page for page in named if page.is_file()), *LAST]
 
 
 def commands(text: str, heading: str | None = None) -> list[str]:

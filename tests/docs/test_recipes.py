@@ -1,4 +1,4 @@
-"""The recipes of CONTRIBUTING: all are applied to a copy of the package, and what they add runs."""
+"""The recipes of the pages: all are applied to a copy of the package, and what they add runs."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 from docs_pages import ROOT
 
+PAGES = ("CONTRIBUTING.md", "docs/how-to/extend.md")
 NEW = {
     "samplers/corner.py": """
 from merge_sumo.samplers.base import LevelwiseSampler
@@ -146,8 +147,8 @@ def run_in(folder: Path, *words: str) -> str:
     return done.stdout
 
 
-def test_the_page_names_the_files_of_its_recipes():
-    text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+def test_the_pages_name_the_files_of_their_recipes():
+    text = "".join((ROOT / page).read_text(encoding="utf-8") for page in PAGES)
     for file in MORE:
         assert f"`{file}`" in text
     for file in NEW:

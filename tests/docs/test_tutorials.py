@@ -26,6 +26,7 @@ def blocks(page):
 def test_the_start_page_leads_to_a_failing_case(tmp_path):
     page = blocks("index.md")
     (tmp_path / "my_vut.py").write_text(*page["python"])
+    assert blocks("../README.md")["python"] == page["python"]
     check, campaign, run, _window, rerun = (shlex.split(block)[1:] for block in page["bash"])
     assert run_in_a_process(tmp_path, *check).code == 0
     printed = run_in_a_process(tmp_path, *campaign).out
@@ -41,7 +42,12 @@ def test_the_start_page_leads_to_a_failing_case(tmp_path):
 def test_the_first_campaign_prints_its_page(tmp_path):
     page = blocks("tutorials/first-campaign.md")
     command = shlex.split(page["sh"][0].splitlines()[0])[1:]
-    assert run_in_a_process(tmp_path, *command, "-q").out == page["text"][0]
+    printed = run_in_a_process(tmp_path, *command, "-q").out
+    assert printed == page["text"][0]
+    table, timeline = blocks("../README.md")["text"]
+    assert table.replace("runs/first", "runs/first-campaign") == printed
+    case = run_in_a_process(tmp_path, "run", "--case", "runs/first-campaign", "456")
+    assert case.out.startswith(timeline)
 
 
 def test_the_cases_of_the_ci_page_are_those_of_its_controller(tmp_path, monkeypatch):
