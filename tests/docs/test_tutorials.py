@@ -58,8 +58,6 @@ def test_the_cases_of_the_ci_page_are_those_of_its_controller(tmp_path, monkeypa
     controller = (tmp_path / "ci" / "controller.py").read_text().replace("+ 2.0", "+ 0.2")
     (tmp_path / "ci" / "controller.py").write_text(controller)
     now = ms.rerun("cases.toml", vut="controller.py:Controller")
-    shown = (
-        PAGE.read_text("utf-8").partition("in the place of `+ 2.0`")[2].partition("```text\n")[2]
-    )
+    shown = PAGE.read_text("utf-8").partition("instead of `+ 2.0`")[2].partition("```text\n")[2]
     for line in shown.partition("```")[0].splitlines():
         assert line == "..." or line in now.lines()
