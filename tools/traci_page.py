@@ -13,41 +13,56 @@ from merge_sumo.sumo.traci_names import functions
 
 HEADINGS = ("Answered", "Not answered", *(effect.value for effect in Effect))
 PAGE = Path(__file__).resolve().parent.parent / "docs" / "reference" / "traci.md"
-HEAD = """# What a TraCI controller can do
+HEAD = """# TraCI
 
-In plain SUMO `setSpeed` often seems to do nothing, because in its default speed mode (31) the \
-safe speed of the car-following model, right of way, red lights, and the vehicle's own limits of \
-acceleration and speed override it. It acts in the next step, while `getSpeed` answers the speed \
-of the last one, and it holds until `setSpeed(-1)`, from where on the car-following model drives. \
-All of that is the same here but for the speed mode: `vut` departs in 38, in which its own limits \
-act and the rest does not.
+This page lists what a controller that drives by TraCI can ask and command, and what each command \
+does. [The tutorial](../tutorials/traci-controller.md) shows how to write one.
 
-Made by `python tools/traci_page.py` from SUMO's own client: do not edit.
+`python tools/traci_page.py` makes this page from SUMO's own client: do not edit it.
 
-A second SUMO answers questions. It has the original net and the vehicles `pov` and `vut` (in \
-traffic also `ahead` and `behind`) in their present state, and runs as a library in a process of \
-its own, without a port. merge-sumo itself answers what this SUMO cannot know: the position of a \
-vehicle after the step, and the vehicles that departed and arrived during several steps. A \
-question about an unknown object is refused as by SUMO. Subscriptions to variables of an object \
-are available for all questions, and context subscriptions for the vehicles around a vehicle or a \
-junction, without filters; they hold until they are ended, \
-whatever their begin and end. `getCollisions` tells of contacts, which change no motion.
+## How SUMO answers
 
-The same SUMO carries out commands on `vut` and its type; the speed that its step gives the VUT is \
-the command of the controller, and the campaign then moves the VUT by eq. (4), within the \
-scenario's limits. `vut` departs with its speed set, so a controller without commands keeps its \
-speed. Speed mode 31, `setSpeed(-1)`, `setTau`, `openGap` and `setStop` have their \
-meaning in SUMO, whose car-following model then drives the VUT (deterministically: `sigma` is 0, \
-unless `setImperfection` changes it). On a road with an acceleration lane the lane that the step \
-gives the VUT is its merge request; `vut` departs in lane change mode 0, so nothing but the \
-controller changes its lane ([Lane changes](../tutorials/traci-controller.md#lane-changes)).
+A second SUMO answers questions and carries out commands. It runs as a library in a separate \
+process, without a port. It has the original net and all vehicles in their present state:
 
-`setPreviousSpeed` and `moveToXY` say what [a vehicle model of the controller's own]\
-(../tutorials/traci-controller.md#a-vehicle-model-of-your-own) has reached after the step; they go \
-before SUMO's speed. `getParameter("vut", "seed")` is the seed of the case. Other commands are \
-accepted without effect (the last lines of a campaign name those that could move a vehicle in \
-SUMO), or refused with a reason, as an error of that command; \
-the connection stays open. [Why SUMO decides](../explanation/decisions/traci-server.md).
+| vehicle | meaning |
+|---|---|
+| `vut` | VUT (vehicle under test): the vehicle that your controller drives |
+| `pov` | POV (primary other vehicle): the vehicle on the mainline (main road) |
+| `ahead`, `behind` | the cars ahead of and behind the POV, in traffic |
+
+Questions:
+
+- merge-sumo itself answers two questions that this SUMO cannot answer: the position of a vehicle \
+after the step, and the vehicles that departed and arrived during several steps.
+- A question about an unknown object is refused, as in SUMO.
+- Subscriptions work for all variables of an object. Context subscriptions work for the vehicles \
+around a vehicle or a junction, without filters. A subscription ends only when you end it: its \
+begin and end time have no effect.
+- `getCollisions` returns contacts. A contact does not change the motion.
+- `getParameter("vut", "seed")` is the seed of the case.
+
+Commands:
+
+- Commands act on `vut` and its type. SUMO's step turns them into a speed. The campaign gives the \
+VUT this speed by eq. (4) of the paper, within the limits of the scenario.
+- `vut` departs with its speed set. A controller without commands keeps its speed.
+- On a road with an acceleration lane, the lane that SUMO's step gives the VUT is its \
+[merge request](vuts.md#merging-from-an-acceleration-lane).
+- All other commands are accepted without effect, or refused with a reason as an error of that \
+command. The connection stays open.
+
+[Why SUMO decides](../explanation/decisions/traci-server.md) has the reasons.
+
+## Differences from SUMO
+
+In plain SUMO, `setSpeed` often seems to have no effect. In its default speed mode (31), other \
+rules override it: the safe speed of the car-following model, right of way, red lights, and the \
+limits of the vehicle. Here `vut` departs in speed mode 38: only the limits of the vehicle \
+override `setSpeed`.
+
+The rest is as in SUMO. A speed acts in the next step, and `getSpeed` returns the speed of the \
+last step.
 
 ## Start, end and connection
 
@@ -69,7 +84,7 @@ an error.
 
 ## Commands that move the VUT
 
-- `setSpeed` acts in the next step and holds until `setSpeed(-1)`.
+- `setSpeed` acts in the next step, until `setSpeed(-1)`.
 - `setSpeed`, `slowDown` and `setAcceleration` set the speed. When `slowDown` or `setAcceleration` \
 has ended, and after `setSpeed(-1)`, the car-following model of SUMO drives the VUT.
 - `setSpeedMode(31)`, `setTau`, `openGap`, `setStop` and other commands act as in SUMO.
@@ -85,11 +100,11 @@ it, with the number of cases in which the controller gave it.
 ## A vehicle model of the controller
 
 - `setPreviousSpeed` sets the speed of `vut` after the next step. It overrides all other commands, \
-in any order, for this step only. In a step without it, a commanded speed acts; without a \
-commanded speed, `vut` keeps its speed. In a long `simulationStep(time)` it holds for all steps.
+in any order, for this step only. In a step without it, a commanded speed acts, or `vut` keeps \
+its speed. In a long `simulationStep(time)` it applies to all steps.
 - `moveToXY` sets the position of the front bumper after the next step. merge-sumo derives the \
-speed: the way along the lane from the point of the previous step, divided by 0.1 s. The first \
-point counts from the position of `vut`. `getPosition` then returns the point, as in SUMO.
+speed: the distance along the lane from the point of the previous step, divided by 0.1 s. The \
+first point counts from the position of `vut`. `getPosition` then returns the point, as in SUMO.
 - With `moveToXY`, `vut` has the new speed only from the end of the step on (eq. (4)). It is \
 therefore a little before or after the point: by 0.1 s times the speed gained since the first \
 point, and after a clipped step by the clipped distance. `getLanePosition`, gaps and verdicts use \
@@ -100,11 +115,10 @@ the position of `vut`.
 `keepRoute` and `matchThreshold` have no effect. Next to an acceleration lane the nearer lane \
 counts: a model that crosses over merges.
 - The limits of the scenario clip the speed. `clipped_steps` counts clipped steps up to M, and \
-`getSpeed` returns the driven speed, from which a model must continue. A negative speed is \
+`getSpeed` returns the driven speed. A model must continue from that speed. A negative speed is \
 refused. A speed that is not a number ends the case as an error.
-- `getSpeed` returns the driven speed. In SUMO such a loop reads there the speed that the driver \
-of SUMO chose. Here `getSpeedWithoutTraCI` returns the speed that SUMO chose in the last step \
-(after `setSpeed("vut", -1)`).
+- In SUMO `getSpeed` returns in such a loop the speed that the driver of SUMO chose. Here use \
+`getSpeedWithoutTraCI`, which returns that speed of the last step (after `setSpeed("vut", -1)`).
 - Leave out `--act`, which adds its own delay and lag. A model with a first-order lag of 0.3 s \
 drives as the law without the model and with `--act lag_s=0.3`, to 1e-6 m (`pytest \
 tests/controllers/test_traci_commands.py -k VehicleModel`).
@@ -123,6 +137,16 @@ considers unsafe. In mode 1621, the default of SUMO, the lane-change model merge
 adapts the speed only after `setSpeed("vut", -1)`. The car-following model then stops before the \
 end of the lane until the VUT can merge.
 - The merge is final: a later lane change of `vut` is undone.
+
+## All functions
+
+The following lists have all functions of SUMO's client, by domain.
+"""
+TAIL = """
+## Next step
+
+- [A TraCI controller](../tutorials/traci-controller.md) writes and runs one.
+- [Kinds of controllers](vuts.md) has the rules that all controllers follow.
 """
 
 
@@ -139,10 +163,11 @@ def sections() -> Iterator[str]:
         listed = domains.setdefault(domain, {}).setdefault(heading, [])
         listed += [f"`{name.partition('.')[2]}`" for name in names]
     for domain, mine in sorted(domains.items(), key=lambda item: (item[0] != "vehicle", item[0])):
-        yield f"\n## {domain}\n"
+        yield f"\n### {domain}\n"
         for heading in HEADINGS:
             if heading in mine:
                 yield f"\n{heading}: {', '.join(sorted(mine[heading]))}.\n"
+    yield TAIL
 
 
 def page() -> str:

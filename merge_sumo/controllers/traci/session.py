@@ -61,12 +61,12 @@ class Effect(Enum):
     """Effect of a command on the simulation."""
 
     CARRIED_OUT = "Carried out by SUMO, on the VUT and its type"
-    ON_A_LANE = "Carried out by SUMO on a road with an acceleration lane; elsewhere changes nothing"
-    REACHED = "Taken as what a vehicle model of the controller's own reaches in the step"
+    ON_A_LANE = "Carried out by SUMO on a road with an acceleration lane, without effect elsewhere"
+    REACHED = "Sets the speed or position that the controller's vehicle model reaches in the step"
     OWN_KEYS = "Carried out by SUMO on the VUT, for keys without a dot"
-    LOOKS = "Accepted, changes nothing"
-    IN_VAIN = "Accepted, changes nothing here but would in SUMO"
-    REFUSED = "Refused: the scenario and the campaign decide it"
+    LOOKS = "Accepted without effect"
+    IN_VAIN = "Accepted without effect; in SUMO it has one"
+    REFUSED = "Refused, because the scenario or the campaign sets it"
 
 
 SPEEDS = "setSpeed slowDown setAcceleration setSpeedMode"
