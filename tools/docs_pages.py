@@ -53,6 +53,31 @@ def cli_page() -> str:
     return re.sub(r"\n {8,}", " ", text)
 
 
+MEASURES_HEAD: Final = """# Measures
+
+This page lists the measures of a case. They are in `outcomes.jsonl`, in the report, and in the \
+conditions of `--fail-when`.
+
+- VUT (vehicle under test): the vehicle that your controller drives.
+- POV (primary other vehicle): the vehicle on the mainline (main road) that reacts to it.
+- M (merge point): where both lanes become one. Positions x are 0 at M and negative before it.
+- Follow-up: the simulated time after M, by default 3 s.
+"""
+MEASURES_TABLE: Final = """
+The last column shows which values are worse. [A condition](verdicts.md#measures-without-a-value) \
+uses a number in the place of None.
+
+| name | unit | definition | worse |
+|---|---|---|---|
+"""
+MEASURES_NEXT: Final = """
+## Next step
+
+- [Failure criteria](verdicts.md) shows how to write a condition over measures.
+- [Add a measure](../../CONTRIBUTING.md) of your own.
+"""
+
+
 def measures_page() -> str:
     """Return the measures of an episode as a table."""
     from merge_sumo.metrics.measures import MEASURES, Measures
@@ -61,13 +86,12 @@ def measures_page() -> str:
     for name, measure in MEASURES.items():
         about = f"{measure.about}.".replace("|", r"\|")
         if measure.only_with:
-            about += f" Recorded with {measure.only_with} only."
-        worse = f"{measure.worse}er values" if measure.worse else ""
+            about += f" Only with {measure.only_with}."
+        worse = f"{measure.worse}er" if measure.worse else ""
         rows += f"| `{name}` | {measure.unit} | {about} | {worse} |\n"
-    head = "| name | unit | definition | worse |\n|---|---|---|---|\n"
     # Further paragraphs of the docstring are about the code.
-    about = "\n\n".join(inspect.cleandoc(Measures.__doc__ or "").split("\n\n")[:2])
-    return f"# Measures\n\n{about}\n\n{head}{rows}"
+    _, about, *_ = inspect.cleandoc(Measures.__doc__ or "").split("\n\n")
+    return f"{MEASURES_HEAD}\n{about}\n{MEASURES_TABLE}{rows}{MEASURES_NEXT}"
 
 
 WRITTEN: dict[str, Callable[[], str]] = {

@@ -156,20 +156,21 @@ def measure(
 
 
 class Measures:
-    """Named measures of one episode.
+    """The measures of one episode (one simulated case), by name.
 
-    dx, dv, TTC, DRAC and the order of merging are taken at t1, the first step with x_VUT >= 0, or
-    with an acceleration lane the step of the merge; they are None when the VUT never arrived. In
-    traffic they are of the car of the mainline that is nearest to the VUT at the end. Severity,
-    clearance, bumper gap, braking after M, and impact speed are of all cars.
+    `dx_m`, `dv_mps`, `ttc_s`, `drac_mps2` and `merged_first` belong to the time t1. This is the
+    first step with x_VUT >= 0, or the step of the merge on a road with an acceleration lane. They
+    are None if the VUT never arrived. In traffic the POV of a definition is the car of the mainline
+    that is nearest to the VUT at t1. Severity, clearance, bumper gap, braking after M and impact
+    speed take all cars into account.
 
-    A measure is computed when it is first read, or by `compute_all`. Recorded measures have no
-    trajectory.
+    A measure is computed when it is first read, or by `compute_all`. Measures that were read from
+    a record have no trajectory.
 
     Attributes:
-        trajectory: the motion of the episode.
-        encounter: how near the VUT came to others; by default to none (`measures_of`).
-        values: the values that are known, by name.
+        trajectory: motion of the episode.
+        encounter: how close the VUT came to other cars (`measures_of`).
+        values: the computed values, by name.
 
     Example:
         >>> measures = Measures.of(trajectory)
@@ -179,7 +180,7 @@ class Measures:
     encounter: Encounter = NONE_MET
 
     def __init__(self, trajectory: Trajectory | None = None, **values: Any) -> None:
-        """Take an episode, or recorded values.
+        """Take the motion of an episode, or recorded values.
 
         Args:
             trajectory: the motion; None for recorded values.
@@ -194,22 +195,22 @@ class Measures:
 
         Args:
             trajectory: the motion.
-            lines: centre lines of the road; None for no clearance before M.
+            lines: centre lines of the road; without them there is no clearance before M.
         """
         (measures,) = measures_of([trajectory], lines)
         measures.compute_all()
         return measures
 
     def compute_all(self) -> None:
-        """Compute the measures that were not read yet."""
+        """Compute all measures that have no value yet."""
         for name in known_measures():
             self.value(name)
 
     def value(self, name: str) -> Any:
-        """Return the value of a measure; None where the episode has none.
+        """Return the value of a measure; None if the episode has none.
 
         Args:
-            name: name of the measure, of this package or another.
+            name: name of the measure, of this package or of an installed one.
         """
         if name not in self.values:
             known = known_measures()[name]
@@ -235,32 +236,32 @@ class Measures:
 
     @property
     def result(self) -> str:
-        """The result of the episode in a word: its severity, or its end where it has none."""
+        """The severity of the episode, or its end if it has no severity."""
         return self.severity or self.end.value
 
     @property
     def is_close(self) -> bool:
-        """Whether the front bumpers were nearer at M than the paper allows: its rule of a crash."""
+        """Whether the case fails by the paper: the front bumpers are too close at M."""
         return self.score is not None and self.score < FAILURE_SCORE
 
     @measure()
     def end(self) -> End:
-        """Why the episode ended."""
+        """Reason of the end: MERGED, TIMEOUT, VUT_ERROR or SIM_ERROR."""
         return self.trajectory.end
 
     @measure(worse="low", label="score P", digits=0, missing=0.0)
     def score(self) -> float | None:
-        """P, never positive; None without a verdict (VUT_ERROR, SIM_ERROR)."""
+        """Score P of the paper, never positive. None after an error (VUT_ERROR, SIM_ERROR)."""
         return merge_score(self.trajectory)
 
     @measure(label="front bumpers, x_POV - x_VUT", column="Δx at M", missing=math.inf)
     def dx_m(self) -> float | None:
-        """x_POV - x_VUT, of the front bumpers."""
+        """Distance of the front bumpers, x_POV - x_VUT."""
         return self._at_m(0)
 
     @measure(label="v_POV - v_VUT", column="dv", missing=0.0)
     def dv_mps(self) -> float | None:
-        """v_POV - v_VUT."""
+        """Difference of the speeds, v_POV - v_VUT."""
         return self._at_m(1)
 
     def _at_m(self, column: int) -> float | None:
@@ -272,7 +273,7 @@ class Measures:
 
     @measure(worse="low", label="time to collision", column="TTC")
     def ttc_s(self) -> float | None:
-        """Time to collision of the front bumpers, -dx/dv where dx dv < 0, else None (infinite)."""
+        """Time to collision of the front bumpers, -dx/dv. None (infinite) unless dx dv < 0."""
         dx, dv = self.dx_m, self.dv_mps
         return None if dx is None or dv is None else time_to_collision(dx, dv)
 
@@ -280,20 +281,20 @@ class Measures:
     def pet_s(self) -> float | None:
         """Post-encroachment time: time between the two front bumpers at M (Allen et al., 1978).
 
-        A POV that has not arrived by t1 keeps its speed at t1; None when it stands.
+        A POV that has not reached M at t1 is assumed to keep its speed. None if it stands.
         """
         return _post_encroachment_time(self.trajectory) if self.end is End.MERGED else None
 
     @measure(column="time", missing=0.0)
     def t_end_s(self) -> float:
-        """Time at which the episode ended."""
+        """Time of the end, or of the merge."""
         return self.trajectory.t_end_s
 
     @measure()
     def severity(self) -> Severity | None:
-        """Contact, conflict, harsh or safe (`merge.py`).
+        """Class of the motion: contact, conflict, harsh or safe.
 
-        None without a contact where the VUT never reached M, and after an error.
+        None after an error, and if the VUT neither touched a car nor reached M.
         """
         if self.encounter.row is not None:
             return Severity.CONTACT
@@ -307,16 +308,17 @@ class Measures:
     def bumper_gap_m(self) -> float | None:
         """Smallest gap between bumpers at M.
 
-        From the front bumper of the car behind to the rear bumper of the car ahead, negative where
-        bodies overlap; None without a merge.
+        It goes from the front bumper of the car behind to the rear bumper of the car ahead, and is
+        negative if the bodies overlap. None without a merge.
         """
         return float(gaps_at_m(self.trajectory)[0].min(initial=math.inf))
 
     @measure(worse="low", label="smallest gap from M on, or overlap", column="clearance")
     def clearance_m(self) -> float | None:
-        """Smallest gap between bumpers from M on, or less where bodies overlap, also before M.
+        """Smallest gap between bumpers from M on, or the overlap of bodies if that is less.
 
-        0 or less with a contact, None without a contact and a merge.
+        An overlap before M counts too. 0 or less with a contact. None if the VUT neither touched a
+        car nor merged.
         """
         found = self.bumper_gap_m, self.after_gap_m, self.encounter.overlap_m
         return min(value for value in found if value is not None)
@@ -325,16 +327,16 @@ class Measures:
     def before_clearance_m(self) -> float | None:
         """Smallest distance of bodies before M, where the lanes run together.
 
-        0 or less where they overlap, None where the VUT never came there.
+        0 or less if they overlap. None if the VUT never came there.
         """
         return self.encounter.before_m
 
     @measure(worse="high", label="deceleration to keep 6 m apart")
     def drac_mps2(self) -> float | None:
-        """Deceleration rate to avoid a crash that the follower needs at t1.
+        """Deceleration rate to avoid a crash: the braking that the car behind needs at t1.
 
-        After Cooper and Ferguson (1976): dv^2 / (2 (|dx| - 6)); 0 when the gap opens, None
-        where |dx| < 6 m.
+        It is dv^2 / (2 (|dx| - 6)), after Cooper and Ferguson (1976), and 0 if the gap opens. None
+        if |dx| < 6 m.
         """
         dx, dv = self.dx_m, self.dv_mps
         if dx is None or dv is None or self.is_close:
@@ -346,14 +348,14 @@ class Measures:
 
     @measure(
         worse="high",
-        label="braking that M asks of the rear",
-        column="braking asked after M",
+        label="braking that the car behind needs at M",
+        column="braking needed at M",
     )
     def brake_after_mps2(self) -> float | None:
-        """Deceleration of the vehicle behind at M that keeps it from touching the one ahead.
+        """Braking with which the car behind at M does not touch the car ahead.
 
-        It begins after a reaction time of 0.75 s, and the vehicle ahead keeps its speed; None where
-        no braking is in time, and without a merge.
+        It begins after a reaction time of 0.75 s, and the car ahead keeps its speed. None if no
+        braking is enough, and without a merge.
         """
         return brake_after_mps2(self.trajectory) if self.end is End.MERGED else None
 
@@ -364,7 +366,7 @@ class Measures:
         default=0.0,
     )
     def vut_max_brake_mps2(self) -> float:
-        """Hardest braking of the VUT up to t1, positive."""
+        """Hardest braking of the VUT up to t1, as a positive number."""
         return max(0.0, -float(self.trajectory.a_vut_mps2.min()))
 
     @measure(
@@ -374,7 +376,7 @@ class Measures:
         default=0.0,
     )
     def pov_max_brake_mps2(self) -> float:
-        """Hardest braking of the POV up to t1, positive."""
+        """Hardest braking of the POV up to t1, as a positive number."""
         return max(0.0, -float(self.trajectory.motion[:, self.trajectory.nearest, 2].min()))
 
     @measure(
@@ -383,59 +385,59 @@ class Measures:
         column="POV brakes over 1.6 s",
     )
     def pov_sustained_brake_mps2(self) -> float | None:
-        """Largest mean deceleration of the POV over 1.6 s up to t1, or over a shorter episode."""
+        """Largest mean braking of the POV over 1.6 s up to t1, or over a shorter episode."""
         return sustained_brake_mps2(self.trajectory.motion[:, self.trajectory.nearest, 1])
 
     @measure(worse="high", label="slow-down of the POV up to M", column="POV slows by")
     def pov_slowdown_mps(self) -> float | None:
-        """Largest loss of speed of the POV up to t1, from the highest speed before."""
+        """Largest loss of speed of the POV up to t1, compared with its highest speed before."""
         v_mps = self.trajectory.motion[:, self.trajectory.nearest, 1]
         return float((np.maximum.accumulate(v_mps) - v_mps).max())
 
     @measure(worse="high", label="impact speed", column="impact")
     def impact_speed_mps(self) -> float | None:
-        """Relative speed, in the plane, as bodies first overlap; None without a contact."""
+        """Relative speed in the plane when bodies first overlap. None without a contact."""
         return self.encounter.impact_mps
 
     @measure()
     def merged_first(self) -> Literal["VUT", "POV"] | None:
-        """Whose front bumper is ahead at M: that of the VUT or the POV."""
+        """Vehicle whose front bumper is ahead at M: VUT or POV."""
         if self.dx_m is None:
             return None
         return "VUT" if self.dx_m < 0 else "POV"
 
     @measure(worse="low", label="avoidable until")
     def last_avoidable_s(self) -> float | None:
-        """Last time from which the VUT could have kept 6 m, where |dx| < 6 m at M.
+        """Last time from which the VUT could have kept 6 m, if |dx| < 6 m at M.
 
-        At full acceleration or full braking by eq. (4), against the recorded motion of the other
-        cars, which then keep their last speed; None without such a time, and where |dx| >= 6 m.
+        The VUT then accelerates or brakes fully by eq. (4). The other cars move as recorded, and
+        then keep their last speed. None if there is no such time, and if |dx| >= 6 m.
         """
         return last_avoidable_s(self.trajectory) if self.is_close else None
 
     @measure()
     def avoidable(self) -> bool | None:
-        """Whether the VUT could have kept 6 m from some time on; None where |dx| >= 6 m at M."""
+        """Whether `last_avoidable_s` exists. None if |dx| >= 6 m at M."""
         return self.last_avoidable_s is not None if self.is_close else None
 
     @measure(worse="high", digits=0, default=0)
     def clipped_steps(self) -> int:
-        """Steps in which the VUT asked for more than its limits of acceleration."""
+        """Number of steps in which the limits of acceleration clipped the VUT."""
         return self.trajectory.clipped_steps
 
     @measure()
     def error(self) -> str | None:
-        """Message of an error of the VUT or of the simulation, also after M; None without one."""
+        """Message of an error of the controller or of the simulation, also after M."""
         return None if self.trajectory.error is None else as_reason(self.trajectory.error)
 
     @measure(only_with=TRAFFIC, default=VEHICLES[POV])
     def nearest(self) -> Vehicle:
-        """Name of the car that the measures are of."""
+        """Name of the car that counts as POV in the definitions."""
         return VEHICLES[self.trajectory.nearest]
 
     @measure(worse="low", label="smallest bumper gap after M", only_with=FOLLOW_UP)
     def after_gap_m(self) -> float | None:
-        """Least gap between bumpers in the follow-up, 0 or less where bodies touch.
+        """Smallest gap between bumpers in the follow-up, 0 or less if bodies touch.
 
         None without a merge.
         """
@@ -443,9 +445,9 @@ class Measures:
 
     @measure(worse="low", label="time to collision after M", only_with=FOLLOW_UP)
     def after_ttc_s(self) -> float | None:
-        """Lowest time to collision between bumpers in the follow-up, 0 where bodies touch.
+        """Lowest time to collision between bumpers in the follow-up, 0 if bodies touch.
 
-        None where no gap closes, and without a merge.
+        None if no gap closes, and without a merge.
         """
         gap_m, closing_mps = self._after()
         if (gap_m <= 0.0).any():
@@ -454,9 +456,9 @@ class Measures:
 
     @measure(worse="high", label="braking needed after M", only_with=FOLLOW_UP)
     def after_drac_mps2(self) -> float | None:
-        """Hardest braking that the follow-up needs, dv^2 / (2 gap).
+        """Hardest braking that is needed in the follow-up, dv^2 / (2 gap).
 
-        None where bodies touch, and without a merge.
+        None if bodies touch, and without a merge.
         """
         if self.after_gap_m is None or self.after_gap_m <= 0.0:
             return None
@@ -466,10 +468,10 @@ class Measures:
 
     @measure(worse="high", label="hardest braking after M", only_with=FOLLOW_UP)
     def after_brake_mps2(self) -> float | None:
-        """Hardest braking in the follow-up, as driven; `brake_after_mps2` is the braking needed.
+        """Hardest braking that happens in the follow-up.
 
-        It is of cars behind the VUT, and of the VUT where the nearest car is ahead; None without a
-        merge.
+        It is the braking of cars behind the VUT, and of the VUT if the nearest car is ahead. None
+        without a merge.
         """
         after = self.trajectory.after
         if after is None:
@@ -485,9 +487,9 @@ class Measures:
         rows = self.trajectory.motion[:0] if after is None else after
         return gaps_m(rows, self.trajectory.case.scenario.lengths_m)
 
-    @measure(label="place of the merge", column="merges at", missing=math.inf, only_with=LANE)
+    @measure(label="position of the merge", column="merges at", missing=math.inf, only_with=LANE)
     def x_merge_m(self) -> float | None:
-        """Place on an acceleration lane where the VUT merges; None without a merge."""
+        """Position at which the VUT merges from the acceleration lane. None without a merge."""
         merges = self.trajectory.case.scenario.lane_m and self.end is End.MERGED
         return place_of_merge_m(self.trajectory) if merges else None
 
@@ -499,7 +501,7 @@ class Measures:
         only_with=LANE,
     )
     def lane_share(self) -> float | None:
-        """Place of the merge as a share of the acceleration lane, from its begin.
+        """Share of the acceleration lane that the VUT uses before it merges.
 
         None without a merge.
         """
@@ -510,12 +512,12 @@ class Measures:
 
     @measure(worse="low", label="gap ahead at the merge", only_with=LANE)
     def gap_ahead_m(self) -> float | None:
-        """Bumper gap at the merge to the car ahead; None without such a car or a merge."""
+        """Gap between bumpers to the car ahead at the merge. None without a car or a merge."""
         return self._lane_gap(is_ahead=True)[0]
 
     @measure(worse="low", label="gap behind at the merge", only_with=LANE)
     def gap_behind_m(self) -> float | None:
-        """Bumper gap at the merge to the car behind; None without such a car or a merge."""
+        """Gap between bumpers to the car behind at the merge. None without a car or a merge."""
         return self._lane_gap(is_ahead=False)[0]
 
     @measure(
@@ -526,7 +528,7 @@ class Measures:
         only_with=LANE,
     )
     def time_gap_ahead_s(self) -> float | None:
-        """Gap ahead over the speed of the VUT; None without a gap, and where the VUT stands."""
+        """`gap_ahead_m` over the speed of the VUT. None without a gap, or if the VUT stands."""
         return self._lane_gap(is_ahead=True)[1]
 
     @measure(
@@ -537,7 +539,7 @@ class Measures:
         only_with=LANE,
     )
     def time_gap_behind_s(self) -> float | None:
-        """Gap behind over the speed of the car behind; None without a gap, and where it stands."""
+        """`gap_behind_m` over the speed of the car behind. None without a gap, or if it stands."""
         return self._lane_gap(is_ahead=False)[1]
 
     def _lane_gap(self, *, is_ahead: bool) -> tuple[float | None, float | None]:
@@ -554,13 +556,13 @@ class Measures:
 
     @measure(
         worse="high",
-        label="stood on the lane",
-        column="stood",
+        label="time standing on the lane",
+        column="stands",
         only_with=LANE,
         default=0.0,
     )
     def stood_s(self) -> float:
-        """Time for which the VUT stood on the acceleration lane."""
+        """Time that the VUT stands on the acceleration lane."""
         lane_m = self.trajectory.case.scenario.lane_m
         if lane_m is None or self.end.is_error:
             return 0.0
