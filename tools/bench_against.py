@@ -1,16 +1,18 @@
-"""How much of what a new version breaks a campaign against the old version finds.
+"""Measure how many of the failures of a new version a campaign against the old version finds.
 
     python tools/bench_against.py --seeds 10 --first 1000
 
-Pairs of versions, at one level each: `design2` that gives way later, a controller with a longer
-reaction time, and `gap`, on an acceleration lane, that accepts shorter gaps. Dense truths of both
-versions have the same uniform cases; those that the new version alone fails are the regressions.
-The share of these within the radius of the FMC of a regression that was found is printed after 40
-cases, as median with the least and the most over the seeds:
+A regression is a case that only the new version fails. There are three pairs of versions, at one
+POV level each: `design2` that gives way later, a controller with a longer reaction time, and `gap`,
+on an acceleration lane, that accepts shorter gaps. Dense truths of both versions have the same
+uniform cases, and so contain the regressions.
 
-- `against`: of a campaign against the old version;
-- `independent`: of a campaign of each version, whose failures run again with the other version;
-- `oracle`: of greedy picks among the regressions of the truth.
+The script prints the share of the regressions within the radius of FMC of a regression that was
+found, after 40 cases: the median, the minimum and the maximum over the seeds.
+
+- `against`: a campaign against the old version;
+- `independent`: a campaign of each version, whose failures run again with the other version;
+- `oracle`: greedy picks among the regressions of the truth.
 """
 
 from __future__ import annotations

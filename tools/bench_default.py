@@ -1,8 +1,8 @@
 """Time README's campaign in units of fixed work: `python tools/bench_default.py`.
 
-The whole command runs in a process of its own, the unit before and after each run in another one:
-six rounds of an SVD of a 600 x 600 normal matrix and of 1.5 million steps in pure Python. Prints
-the median of the runs in seconds and in units, with the least and the largest.
+The whole command runs in a process of its own. Before and after each run, another process measures
+the unit: six rounds of an SVD of a 600 x 600 normal matrix and of 1.5 million steps in pure Python.
+The script prints the median of the runs in seconds and in units, with minimum and maximum.
 """
 
 from __future__ import annotations

@@ -1,15 +1,15 @@
-"""Compare the SUMO host with its peers, all in one run: `python tools/bench_host.py`.
+"""Compare the SUMO host with other ways to run SUMO: `python tools/bench_host.py`.
 
     host     rollouts of the rule-based VUT against the level-0 POV: drivers, commands, positions
              read back from SUMO and checked at every step, refills, trajectories
-    bare     the same vehicles through the same motion in a plain libsumo loop: two commands, a
-             step, two getters for each; the speeds are known beforehand, nothing is kept
-    step     the same vehicles at constant speeds, and nothing at all but simulation steps
-    process  a TraCI server started for every case, with the same drivers
+    bare     the same vehicles with the same motion in a plain libsumo loop: two commands, a step,
+             two getters for each; the speeds are computed beforehand, nothing is stored
+    step     the same vehicles at constant speeds: only simulation steps
+    process  a TraCI server that is started for every case, with the same drivers
 
-Host, bare and step take turns, several rounds for each number of corridors K, and for K = 32 also
-in traffic, with A = 4 vehicles in a corridor; the figures are medians over the rounds, with the
-spread in brackets. A step is that of a corridor with all its vehicles.
+Host, bare and step take turns, several rounds for each number of corridors K. For K = 32 they also
+run in traffic, with A = 4 vehicles in a corridor. The figures are medians over the rounds, with the
+spread in brackets. A step is the step of a corridor with all its vehicles.
 """
 
 from __future__ import annotations

@@ -1,15 +1,15 @@
-"""Measure the regret on an acceleration lane of a POV that knows a merge at M.
+"""Measure the regret, on an acceleration lane, of a POV that expects a merge at M.
 
     python tools/bench_lane.py [--cases 300] [--seed 1]
 
-The VUT drives the level-0 profile and merges at a place that the POV does not know: where the lane
-begins, at M, in the middle of the rest, at the lane's end. The POV is that of level 1 by the rule
+The VUT drives the level-0 profile and merges at a place that the POV does not expect: at the begin
+of the lane, at M, half-way from M to the end, or at the end. The POV is of level 1, with the rule
 of `merge_sumo/drivers/after_merge.py`. Its return up to the merge is compared with the exact best
-response of a driver that knows the place. Regret is a share of what that driver gains over one that
-keeps its speed; for M it is that of the point merge.
+response of a driver that has the place. Regret is a share of the gain of this driver over a driver
+that keeps its speed. For M it is the regret of the point merge.
 
-Then how hard cars brake in the 5 s after merges at M that need at most 1 m/s2 of the car behind, at
-level 0: by ACC, as they do, and by IDM.
+The script also measures how hard cars brake in the 5 s after merges at M that need at most 1 m/s2
+of the car behind, at level 0: with ACC, as in campaigns, and with IDM.
 """
 
 from __future__ import annotations

@@ -4,12 +4,12 @@
     python tools/bench_samplers.py time
     python tools/bench_samplers.py per-case
 
-`dense` compares with a truth of 1,000,000 cases by the kinematic engine: the share of its FMC after
-few cases, and the cases to .9 of it as a ratio to those of an oracle, which knows all failures of
-the truth and takes the most useful one each time. `time` prints the seconds of CPU that a sampler
-takes for a batch after N cases. `per-case` prints the CPU time of `coverage` with its model of the
-controller for a case at three levels after N uniform cases, and the memory of the model.
-`merge-sumo benchmark` compares samplers on any VUT.
+`dense` compares with a truth of 1,000,000 cases by the kinematic engine. It prints the share of the
+truth's FMC after few cases, and the cases to .9 of it as a ratio to an oracle, which has all
+failures of the truth and takes the most useful failure each time. `time` prints the seconds of CPU
+that a sampler takes for a batch after N cases. `per-case` prints the CPU time of `coverage` with
+its model of the controller for a case at three levels after N uniform cases, and the memory of the
+model. `merge-sumo benchmark` compares samplers on any VUT.
 """
 
 from __future__ import annotations

@@ -3,22 +3,22 @@
     python tools/bench_scale.py [PART...]
 
     truth      uniform cases of the rule-based VUT against the level-0 POV on a worker process:
-               cases per second and the largest memory of a process
+               cases per second, and the maximum memory of a process
     workers    the same cases on one worker process and on two, in turns, next to a loop that only
-               computes: what the machine itself can give. Then the cases per second of the process
-               that asks, tells and keeps, where workers are no limit, and how many workers that
-               feeds
+               computes and shows what the machine can give. Then the cases per second of the
+               process that asks, tells and stores, where workers are no limit, and how many workers
+               it can supply
     engines    verdicts on uniform cases of design2 at level 2 by SUMO and by the kinematic engine,
-               which runs one case of a hundred in SUMO as well: CPU time per case, in turns
+               which also runs one case in a hundred in SUMO: CPU time per case, in turns
     in-flight  the whole command of a campaign whose VUT sleeps for a case, with --in-flight on
                sixteen workers and in batches on one, and cases to .9 of the truth of design2 with
-               both. One worker is computed from a run with a VUT that sleeps hardly at all, and the
+               both. One worker is computed from a run with a VUT that hardly sleeps, and the
                computation is compared with a measurement on few cases
     campaign   the whole command of a uniform campaign of design2, from its start to the report, on
                one worker and on two, in turns
     files      reading `outcomes.jsonl`, FMC and regions of its failures, the report
 
-Figures are medians with the least and the most. `--most 1000000` takes a million cases.
+Figures are medians with minimum and maximum. `--most 1000000` runs a million cases.
 """
 
 from __future__ import annotations

@@ -1,15 +1,15 @@
-"""Measure what a step of each kind of VUT costs, in one run: `python tools/bench_vuts.py`.
+"""Measure what a step of each kind of VUT costs: `python tools/bench_vuts.py`.
 
-    python   an object with act(seen), in one corridor and per corridor of 32, in a process of its
-             own and in this one
-    traci    a client of the stock `traci` package in a process of its own: an id list, four
-             getters, setSpeed and a step; and one that subscribes to the same values
+    python   an object with act(seen), in one corridor and per corridor of 32, in its own process
+             and in this process
+    traci    a client of the stock `traci` package in its own process: an id list, four getters,
+             setSpeed and a step; and a client that subscribes to the same values
     peer     the same client with SUMO's own TraCI server for two clients, where the other client
-             moves the POV: what hosting a controller costs without our server
+             moves the POV: the cost of hosting a controller without our server
     fmu      a level-0 FMU of FMI 2.0, compiled here, in one corridor
     onnx     the exported vut1, deciding at every step, in one corridor
 
-Rounds take turns over the kinds; the figures are medians in microseconds, with the range.
+Rounds take turns over the kinds. The figures are medians in microseconds, with the range.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
-"""Build an FMU that drives as the level-0 VUT, by FMI 2.0 or 3.0: for tests and the benchmark.
+"""Build an FMU that drives as the level-0 VUT, with FMI 2.0 or 3.0, for tests and the benchmark.
 
-`python tools/build_fmu.py level0.fmu [2.0|3.0] [number|boolean]`. With the last word it has an
-output `merge`, which requests the merge from 50 m before M on. It needs a C compiler, gcc or g++.
+`python tools/build_fmu.py level0.fmu [2.0|3.0] [number|boolean]`. With the last word, the FMU has
+an output `merge` of this type, which requests the merge from 50 m before M on. The script needs a C
+compiler, gcc or g++.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Build the nets of sumo_net/ from the plain XML next to them: `python tools/build_net.py`.
 
-Runs `netconvert -c` on every .netccfg and drops the header, which holds the time of the build, so
-that the same sources give the same bytes.
+Runs `netconvert -c` on every .netccfg. It drops the header, which contains the time of the build,
+so that the same sources give the same bytes.
 """
 
 from __future__ import annotations

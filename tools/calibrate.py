@@ -1,14 +1,16 @@
-"""Search what the paper does not give: the designs of the rule-based VUTs.
+"""Search for parameters that the paper does not give: the designs of the rule-based VUTs.
 
     python tools/calibrate.py designs    designs against the policies
-    python tools/calibrate.py gaps       of the VUT that accepts gaps, in the roundabout
+    python tools/calibrate.py gaps       the VUT that accepts gaps, in the roundabout
 
 A design2 passes when it shows the paper's picture: no failure against the level-0 POV, at least
-three failure regions well apart at level 1, few failures at level 2. Those rank high whose third
-region is not small, whose failures at level 2 are many and in few regions, and around whose
-failures dx grows step by step: a design that is close to failing before it fails, as controllers
-are. A design that accepts gaps passes when it never fails in the roundabout at level 0; all that do
-are printed, with where they fail at the other levels. One JSON object per result.
+three failure regions well apart at level 1, and few failures at level 2. The ranking prefers
+designs whose third region is not small, whose failures at level 2 are many and in few regions, and
+around whose failures dx grows step by step. Such a design comes close to failing before it fails,
+as controllers do.
+
+A design that accepts gaps passes when it never fails in the roundabout at level 0. The script
+prints all that pass, with their failures at the other levels, as one JSON object per result.
 """
 
 from __future__ import annotations

@@ -1,11 +1,12 @@
-"""A contest of samplers: twelve frozen problems whose failures are known, one number a sampler.
+"""A benchmark of samplers: twelve problems whose failures are known, one number per sampler.
 
     python tools/contest.py coverage gpr --quick
     python tools/contest.py my_sampler.py:Mine uniform --workers 2 --out mine
 
-The number is the mean over N of 50, 100 and 400 cases, and over the problems, of the median over
-the seeds of min(1, FMC of the failures among the first N cases / FMC of the dense truth). The same
+The number is the mean over N = 50, 100 and 400 cases, and over the problems, of the median over the
+seeds of min(1, FMC of the failures among the first N cases / FMC of the dense truth). The same
 command continues a run that was stopped: searches in its folder do not run again.
+docs/explanation/benchmark.md explains the problems and has results.
 """
 
 from __future__ import annotations

@@ -1,15 +1,16 @@
-"""Let another simulator, HighwayEnv, repeat a campaign: `python tools/crosscheck.py RUN`.
+"""Repeat a campaign in another simulator, HighwayEnv: `python tools/crosscheck.py RUN`.
 
-- Motion: the recorded accelerations are given to HighwayEnv's vehicles, from the recorded starts.
+- Motion: HighwayEnv's vehicles get the recorded accelerations, from the recorded starts.
 - Verdicts: POVs and VUT drive HighwayEnv's vehicles, on the recorded cases and on fresh uniform
-  ones up to `--cases`, and the criterion of the campaign judges them next to SUMO.
+  cases, up to `--cases`. The failure criterion of the campaign judges them next to SUMO.
 
-For campaigns of a VUT of this package. Needs the extra `peers`. Exit code 1 where vehicles with the
-same commands move differently there; docs/how-to/other-simulators.md has the results.
+The script works for campaigns of a VUT of this package, and needs the extra `peers`. Its exit code
+is 1 if vehicles with the same commands move differently in HighwayEnv.
+docs/how-to/other-simulators.md has the results.
 
 HighwayEnv (Leurent, 2018) moves a vehicle that does not steer by x + v dt and v + a dt, which is
-eq. (4). Each vehicle of an episode has a straight lane of its own there, along which it drives its
-lane coordinate: bodies do not meet, as they do not where SUMO moves them by command.
+eq. (4). Each vehicle of an episode has its own straight lane there, along which it drives its lane
+coordinate. Bodies do not meet, as they do not where SUMO moves them by command.
 """
 
 from __future__ import annotations

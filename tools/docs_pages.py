@@ -1,4 +1,4 @@
-"""Pages of the reference that are made from the code, and what the site shows from other folders.
+"""Make the pages of the reference that come from the code, and prepare the pages of the site.
 
 `python tools/docs_pages.py --write` writes those pages into docs/; a test compares them with the
 code. MkDocs calls `on_files` and `on_page_markdown` (see `mkdocs.yml`).

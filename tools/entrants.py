@@ -1,6 +1,6 @@
-"""Samplers that enter the contest: found by name or file, checked, and watched as they search.
+"""Samplers that enter the benchmark: loaded by name or file, checked, and watched in a search.
 
-A file is code of a user: it runs in worker processes, and its faults are results of the search.
+A file is code of a user. It runs in worker processes, and its errors are results of the search.
 """
 
 from __future__ import annotations

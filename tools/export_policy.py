@@ -2,8 +2,8 @@
 
 The network takes the state and gives the action values. `--policies DIR` names another library.
 
-The features are part of the graph. They are not written down a second time: the very function that
-computes them runs on columns that record what is done to them.
+The features are part of the graph. They are not written down a second time: the function that
+computes them runs on columns that record each operation.
 """
 
 from __future__ import annotations

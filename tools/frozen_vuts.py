@@ -1,8 +1,8 @@
-"""The frozen VUTs of the contest of samplers: `frozen:NAME`.
+"""The frozen VUTs of the benchmark of samplers: `frozen:NAME`.
 
-They are of families that real controllers are of, and each fails somewhere; none is good. Their
-constants are in this file and are never tuned: a change of a verdict ends the contest
-(`problems.py`). All are for the merges of US-23. The kind is registered as this module is imported.
+They belong to families of real controllers. Each fails somewhere, and none is good. Their constants
+are in this file and are never tuned: a change of a verdict ends the benchmark (`problems.py`). All
+are for the merges of US-23. Importing this module registers the kind.
 """
 
 from __future__ import annotations

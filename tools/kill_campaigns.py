@@ -1,6 +1,6 @@
 """Kill campaigns and resume them: `python tools/kill_campaigns.py --kills 100`.
 
-Every campaign is killed once (SIGKILL), at a place drawn from a seed, and resumed; then its
+Every campaign is killed once (SIGKILL), at a place drawn from a seed, and resumed. Then its
 outcomes must be those of an undisturbed campaign, byte for byte, and its temporary files must be
 gone. The places take turns:
 

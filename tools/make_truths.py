@@ -1,4 +1,4 @@
-"""Make the dense truths of the contest of samplers, and their manifest.
+"""Make the dense truths of the benchmark of samplers, and their manifest.
 
     python tools/make_truths.py
     python tools/make_truths.py --problems rules,table

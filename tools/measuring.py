@@ -1,7 +1,7 @@
-"""Tools of all benchmarks: a clock, medians with their spread, and `--record FILE`.
+"""Functions for all benchmarks: a clock, medians with their spread, and `--record FILE`.
 
-A record is one JSON line with the figures, the versions and the machine. Ratios on one machine
-compare from version to version; absolute times on different machines do not.
+A record is one JSON line with the figures, the versions and the machine. You can compare ratios on
+one machine from version to version. You cannot compare absolute times on different machines.
 """
 
 from __future__ import annotations

@@ -1,8 +1,9 @@
-"""The problems of the contest of samplers, and their dense truths.
+"""The problems of the benchmark of samplers, and their dense truths.
 
 A problem is a frozen VUT, a scenario and POV levels. `make_truths.py` writes its truth, failures
-among uniform cases, into `truths/`, and the SHA-256 of the file into `manifest.json`. With the
-failures come probe cases and their verdicts: the contest runs only where the code still gives them.
+among uniform cases, into `truths/`, and the SHA-256 of the file into `manifest.json`. The file also
+contains probe cases and their verdicts. The benchmark runs only if the code still gives these
+verdicts.
 """
 
 from __future__ import annotations

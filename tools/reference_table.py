@@ -1,11 +1,11 @@
-"""Print the table of built-in VUTs, SUMO's models and reference drivers that the site has.
+"""Print the site's table of built-in VUTs, SUMO's models and reference drivers.
 
 python tools/reference_table.py                         all of them, 1,000 uniform cases a level
-python tools/reference_table.py --cases 100 design2     fewer, of some
+python tools/reference_table.py --cases 100 design2     fewer cases, of one VUT
 
-Failures and timeouts at POV levels 0, 1 and 2, failure mode coverage of the failures that were
-found, the numbers of failures that the careful driver and the fuzzy safety model avoid in the VUT's
-place, and the median of the times until which the latter may take over.
+The columns are failures and timeouts at POV levels 0, 1 and 2; the failure mode coverage of these
+failures; how many of them the careful driver and the fuzzy safety model avoid in the VUT's place;
+and the median of the latest times at which the fuzzy safety model can take over.
 """
 
 from __future__ import annotations

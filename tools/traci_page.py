@@ -1,4 +1,4 @@
-"""Write the page of what a TraCI client may ask and command: `python tools/traci_page.py`.
+"""Write the page of TraCI questions and commands: `python tools/traci_page.py`.
 
 It is made from SUMO's own client and from the tables by which merge-sumo answers.
 """

@@ -1,4 +1,4 @@
-"""Controllers of kinds that real ones are of, on which no choice of a sampler was made.
+"""Controllers of realistic kinds, on which no choice of a sampler was made.
 
     merge-sumo campaign --vut tools/trial_vuts.py:Idm
     python tools/bench_samplers.py --trials

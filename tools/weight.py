@@ -1,12 +1,12 @@
-"""Compare tokens of each room and frames of the stack with a budget.
+"""Compare tokens of each folder and frames of the stack with a budget.
 
-    python tools/weight.py            print the table; end with 1 where a room is above its budget
-    python tools/weight.py --lower    write today's weights as the budget; the sums only go down
+    python tools/weight.py            print the table; end with 1 if a folder is above its budget
+    python tools/weight.py --lower    write the present weights as the budget; the sums only go down
 
 A token is one of Python's tokenizer without comments, newlines and indentation. Lines are free: a
 loop of four lines is easier to read than a comprehension in a call. The budget is in
-`tools/weight.json`: a room that grows takes from another one in the same change. Frames are those
-of the package below the `act` of a controller of a user in a campaign.
+`tools/weight.json`: a folder that grows takes from another folder in the same change. Frames are
+the frames of the package below the `act` of a controller of a user in a campaign.
 """
 
 from __future__ import annotations
