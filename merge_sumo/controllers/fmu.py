@@ -39,7 +39,7 @@ class FmuKind(FileKind):
     """
 
     form = "fmu:FILE[?VARIABLE=NAME&...]"
-    what = "an FMI 2.0 or 3.0 co-simulation unit, with its names of the variables"
+    what = "an FMI 2.0 or 3.0 co-simulation unit; VARIABLE=NAME maps its names of variables"
     example = '--vut "fmu:controller.fmu?v_vut_mps=Speed&acceleration_mps2=Cmd"'
     no_parameters = "the options of an FMU are the names of its variables"
     library = "fmpy"

@@ -37,7 +37,7 @@ class OnnxKind(FileKind):
     """
 
     form = "onnx:FILE[?decision_period_s=SECONDS]"
-    what = "a network from the state to an acceleration, or to values of the 7 actions"
+    what = "an ONNX network that returns an acceleration, or values of the 7 actions"
     example = "--vut onnx:policy.onnx"
     no_parameters = "the parameters of a network are its weights"
     library = "onnxruntime"

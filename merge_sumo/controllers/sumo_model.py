@@ -57,7 +57,7 @@ class SumoKind(ControllerKind):
     """SUMO's own driver: `sumo:MODEL?NAME=VALUE&...`."""
 
     form = "sumo:MODEL[?OPTION=VALUE&...]"
-    what = "SUMO's own driver: Krauss, IDM, EIDM, ACC or CACC with SUMO's junction logic"
+    what = "a car-following model of SUMO: Krauss, IDM, EIDM, ACC or CACC, with its junction logic"
     example = '--vut "sumo:IDM?tau=1.2"'
     own_code = False
 

@@ -48,16 +48,16 @@ class NamedCriterion:
 CRITERIA = {
     PAPER: NamedCriterion(
         "score < -500",
-        "front bumpers are within 6 m when the VUT reaches M: a contact or a conflict",
+        "front bumpers within 6 m when the VUT reaches M (a contact or a conflict)",
     ),
-    "contact": NamedCriterion("clearance_m <= 0", "a contact: bodies overlap"),
+    "contact": NamedCriterion("clearance_m <= 0", "bodies overlap (a contact)"),
     "unsafe": NamedCriterion(
         "clearance_m <= 0 or brake_after_mps2 > 3",
-        "a contact, or the rear vehicle must brake harder than the 3 m/s2 that UN Regulation "
-        "No. 79 lets a lane change demand of others",
+        "a contact, or the car behind must brake harder than 3 m/s2, which a lane change may "
+        "demand of others by UN Regulation No. 79",
     ),
 }
-"""Criteria by the name that follows `fail_when`."""
+"""Named criteria, for `fail_when`."""
 
 
 TEXTS = {
@@ -66,7 +66,7 @@ TEXTS = {
     "merged_first": frozenset({"VUT", "POV"}),
     "nearest": frozenset(VEHICLES) - {VEHICLES[VUT]},
 }
-"""Values of measures that are texts. Errors have no verdict under any criterion."""
+"""Values of measures that are texts. Errors are not judged under any criterion."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -35,10 +35,10 @@ FORMULA = ("=", "+", "-", "@")
 """First characters of a formula in a spreadsheet."""
 
 FORMATS = {
-    "sumo": "folders that sumo-gui replays",
-    "openscenario": "folders with OpenSCENARIO and OpenDRIVE",
-    "csv": "one table of motion",
-    "cases": "one file to commit: at most 40 cases, or those named",
+    "sumo": "a folder for each case, to replay in sumo-gui",
+    "openscenario": "a folder for each case, with OpenSCENARIO and OpenDRIVE",
+    "csv": "one table with the motion of the cases",
+    "cases": "one file of cases to commit: at most 40, or the cases that you name",
 }
 """Content of each format."""
 

@@ -25,7 +25,7 @@ class AnnealingSampler(LevelwiseSampler):
     history: the random numbers that accept moves depend on the seed and the batch alone.
     """
 
-    about = "looks for the lowest margin by simulated annealing"
+    about = "minimises the margin by simulated annealing"
     colour = "#E69F00"
 
     def propose(

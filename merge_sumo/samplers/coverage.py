@@ -31,7 +31,7 @@ class CoverageSampler(Sampler):
         cases = CoverageSampler(pool, 1, model).ask(15)
     """
 
-    about = "asks for the batch that promises the most new coverage"
+    about = "proposes the batch with the largest expected gain in coverage (FMC)"
     colour = "#D55E00"
     uses_predictions = True
     overlaps = True

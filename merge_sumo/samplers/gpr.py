@@ -41,7 +41,7 @@ class GprSampler(LevelwiseSampler):
     batch lowers the variance for the later ones, which spreads the batch out.
     """
 
-    about = "chooses by a Gaussian process on the margin: the paper's Algorithm 1"
+    about = "the paper's Algorithm 1: predicts the margin by a Gaussian process"
     colour = "#0072B2"
     overlaps = True
 

@@ -85,7 +85,7 @@ class SubsetSampler(LevelwiseSampler):
     distribution each is accepted exactly where it stays in the region.
     """
 
-    about = "draws from ever smaller regions of low margins by Markov chains"
+    about = "subset simulation: draws from smaller and smaller regions of low margins"
     colour = "#009E73"
 
     def propose(
