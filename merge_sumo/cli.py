@@ -43,52 +43,64 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 OPTIONS = Group.create_ordered("Options")
-TESTED = Group.create_ordered("What is tested")
-FAILURE = Group.create_ordered("What counts as a failure")
-CASES = Group.create_ordered("Which cases run")
-PLACE = Group.create_ordered("Where it runs")
-DRIVERS = Group.create_ordered("Drivers and limits")
-GROUPS: Mapping[type[Any], Group] = {
-    c.Test: TESTED,
-    c.ScenarioChanges: TESTED,
-    c.Levels: TESTED,
-    c.StudyOptions: TESTED,
-    c.FailureRule: FAILURE,
-    c.Search: CASES,
-    c.Execution: PLACE,
-    c.Drivers: DRIVERS,
-    c.Limits: DRIVERS,
-    c.Policies: DRIVERS,
+MORE = Group.create_ordered("More options")
+USED = """
+run runs folder file index indices case vut net mainline ramp scenario level x_pov0_m v_pov0_mps
+svo_rad recorded params only check samplers seeds cases seed fail_when against stress traffic
+file_format gui quick figure workers out resume
+"""
+"""Fields that help shows first, in this order. All others are under "More options"."""
+METAVARS: Mapping[str, str] = {
+    "SPEC": "vut pov against",
+    "CASES": "cases batch in_flight truth_cases",
+    "SECONDS": "deadline_s follow_up_s from_s headway_ahead_s headway_behind_s",
+    "GIB": "vut_memory_gib",
+    "FOLDER": "policies resume",
+    "FILE": "junit net distribution figure",
+    "NAME|FILE": "scenario traffic",
+    "LEVEL": "level",
+    "CONDITION": "fail_when require",
+    "NAME": "sampler engine file_format",
+    "NAMES": "samplers",
+    "N": "workers seed seeds repeat",
+    "SHARE": "tolerated confidence",
+    "GATE": "gates",
+    "M": "x_pov0_m",
+    "M/S": "v_pov0_mps",
+    "RAD": "svo_rad",
+    "RUN INDEX": "recorded",
+    "NAME=NUMBER": "sense act at",
+    "NAME=LOW..HIGH": "params",
+    "EDGES": "mainline ramp",
+    "M/S2": "a_min",
 }
-"""Groups of options in help, by the class that declares the field."""
+"""Fields of options, by the placeholder that help shows for their value."""
 FIELDS: Mapping[str, Parameter] = {
     "progress": Parameter(negative=("--quiet", "-q")),
-    "sampler": Parameter(help=f"Sampler that proposes the cases: {either(SAMPLERS)}."),
+    "sampler": Parameter(help=f"Sampler: {either(SAMPLERS)}."),
     "workers": Parameter(show_default=False),
 }
-"""What else an option is, by the name of its field."""
+"""Other settings of an option, by the name of its field."""
 SEARCH, LOOK, CHANGE, OWN, RESEARCH = map(
     Group.create_ordered, ("Search", "Look", "Change", "Bring your own", "Research")
 )
 GONE: Mapping[str, str] = {
-    "board": "`merge-sumo report` prints on A4, and `report --json` has each fact with its source",
+    "board": "`merge-sumo report` prints on A4, and `report --json` lists each fact and its source",
     "crosscheck": "`python tools/crosscheck.py RUN`, in a checkout, repeats cases in HighwayEnv",
     "policies": "`python tools/export_policy.py NAME FILE`, in a checkout, writes an ONNX network",
-    "compare-runs": "`merge-sumo compare RUN RUN...` compares what is recorded",
+    "compare-runs": "`merge-sumo compare RUN RUN...` compares recorded campaigns",
     "history": "`merge-sumo compare RUN RUN...` compares any number of recorded versions",
-    "stress": "`merge-sumo rerun RUN --stress` does it",
-    "repair": "`examples/repair.py`, in a checkout, searches by optuna and `merge_sumo.rerun`",
+    "stress": "`merge-sumo rerun RUN --stress` replaces it",
+    "repair": "`examples/repair.py`, in a checkout, searches with optuna and `merge_sumo.rerun`",
     "certify": "after a campaign without failures, `merge-sumo probability RUN --cases 100000` "
-    "bounds how much of the pool can fail",
+    "gives an upper bound of the share of the pool that fails",
 }
-"""What replaces a command of an earlier version, by its name."""
+"""Replacements of commands of earlier versions, by name."""
 FAULT = 70
-"""Exit code of a fault of this package, as EX_SOFTWARE of sysexits.h."""
+"""Exit code of a bug in this package, as EX_SOFTWARE of sysexits.h."""
 
 Options = Annotated[T, Parameter(name="*")]
-Json = Annotated[
-    bool, Parameter(group=PLACE, help="Print the result as one JSON object on standard output.")
-]
+Json = Annotated[bool, Parameter(help="Print the result as one JSON object.")]
 
 
 class Commands(App):
@@ -109,23 +121,28 @@ class Commands(App):
             if argument.keys and argument.field_info.is_positional:
                 argument.index = index
                 index += 1
-                continue
-            default = argument.field_info.default
-            shown = type(default) in (int, float) or (isinstance(default, str) and default != "")
             # Conditions may begin with a hyphen, and so may edges of nets of OpenDRIVE and OSM.
-            more = Parameter(show_default=shown, allow_leading_hyphen=bool(argument.keys))
-            more = Parameter.combine(more, FIELDS.get(name))
-            for kind, group in GROUPS.items():
-                if argument.keys and name in kind.__annotations__:
-                    more = Parameter.combine(more, Parameter(group=group))
-            argument.parameter = Parameter.combine(argument.parameter, more)
+            more = Parameter(
+                show_default=str(argument.field_info.default) not in ("None", "", "()", "False"),
+                allow_leading_hyphen=bool(argument.keys) and argument.index is None,
+                group=OPTIONS if name in USED.split() else MORE,
+                # Further paragraphs of a docstring are for Python and the reference.
+                help=(argument.parameter.help or "").partition("\n\n")[0],
+            )
+            for metavar, names in METAVARS.items():
+                if name in names.split():
+                    more = Parameter.combine(more, Parameter(metavar=metavar))
+            argument.parameter = Parameter.combine(argument.parameter, more, FIELDS.get(name))
+        arguments.sort(
+            key=lambda each: (*USED.split(), each.field_info.name).index(each.field_info.name)
+        )
         return arguments
 
 
 def use_all_cores(_app: App, _commands: tuple[str, ...], arguments: ArgumentCollection) -> None:
-    """Give a command a worker for each core, where the user names no number.
+    """Start a worker per core, unless the user sets a number.
 
-    In Python the default is one: a script without a main guard would start again in each worker.
+    In Python the default is one, because each worker would run a script without a main guard again.
 
     Args:
         _app: the application.
@@ -141,10 +158,10 @@ app = Commands(
     name="merge-sumo",
     help="""Find where a merging controller fails against drivers who react to it.
 
-    A vehicle under test (VUT) merges from an on-ramp of US-23 in SUMO while a primary other
-    vehicle (POV) on the mainline interacts with it. A sampler chooses the test cases; a case fails
-    where both reach the merge point within 6 m, or by a rule of your own, and failure mode
-    coverage (FMC) says how much of the failing region was found.
+    A vehicle under test (VUT) merges from an on-ramp of US-23 in SUMO. A primary other vehicle
+    (POV) on the mainline reacts to it. A sampler chooses the test cases. A case fails if both
+    vehicles reach the merge point within 6 m of each other, or by your own rule. The failure mode
+    coverage (FMC) shows how much of the failing region the search has found.
 
     Start with:  merge-sumo campaign --vut design2
     """,
@@ -161,7 +178,11 @@ app = Commands(
     print_error=False,
     suppress_keyboard_interrupt=False,
 )
-scenario = Commands(name="scenario", help="The road and the numbers of a merge.", group=OWN)
+scenario = Commands(
+    name="scenario",
+    help="List, write and check scenarios: a road with a merge, and its numbers.",
+    group=OWN,
+)
 app.command(scenario)
 app.register_install_completion_command()
 
@@ -177,11 +198,7 @@ def command(
         name: its name, by default that of the function.
         of: the application that has it.
     """
-
-    def register(function: Callable[..., int]) -> Callable[..., int]:
-        return of.command(function, name, group=group, help=inspect.cleandoc(kind.__doc__ or ""))
-
-    return register
+    return of.command(name=name, group=group, help=inspect.getdoc(kind))
 
 
 @command(c.CampaignOptions, SEARCH)
@@ -189,19 +206,18 @@ def campaign(
     vut: Annotated[
         str,
         Parameter(
-            group=TESTED,
-            help="Vehicle under test: level0, level1, level2, design1 or design2, or your own: "
-            "`merge-sumo vuts` lists the kinds.",
+            help="Vehicle under test: level0, level1, level2, design1, design2, or your own "
+            "controller. `merge-sumo vuts` lists all kinds.",
         ),
     ] = "",
     config: Options[c.CampaignOptions] = c.CampaignOptions(),
     *,
     resume: Annotated[
         Path | None,
-        Parameter(help="Continue the campaign in this folder; --cases may be more."),
+        Parameter(help="Continue the campaign in this folder. --cases may be larger."),
     ] = None,
     out: Annotated[
-        Path | None, Parameter(help="New folder to write; runs/VUT-DATE by default.")
+        Path | None, Parameter(help="New folder to write. [default: runs/VUT-DATE]")
     ] = None,
     json: Json = False,
 ) -> int:
@@ -218,7 +234,7 @@ def campaign(
         The exit code.
     """
     if resume is not None and out is not None:
-        raise UserError("--resume names the folder: leave --out away")
+        raise UserError("--resume already sets the folder: omit --out")
     with stoppable() as check:
         if resume is None:
             run = ms.campaign(vut, **vars(config), out=out, check=check)
@@ -233,7 +249,10 @@ def campaign(
 @command(c.CaseOptions, SEARCH)
 def run(
     vut: Annotated[
-        str | None, Parameter(group=TESTED, help="Vehicle under test, as of a campaign.")
+        str | None,
+        Parameter(
+            help="Vehicle under test, as in `campaign`. [default: with --case that of the campaign]"
+        ),
     ] = None,
     config: Options[c.CaseOptions] = c.CaseOptions(),
     *,
@@ -241,7 +260,7 @@ def run(
         list[str] | None,
         Parameter(
             consume_multiple=True,
-            help="Any coordinates of the case, by their names in outcomes.jsonl: NAME=NUMBER.",
+            help="Coordinates of the case by their names in outcomes.jsonl.",
         ),
     ] = None,
     json: Json = False,
@@ -259,9 +278,9 @@ def run(
     """
 
     def ended(result: CaseRun) -> None:
-        print_result(result, json, **({"out": config.out} if json else {}))
+        print_result(result, json, out=config.out if json else None)
         if config.out is not None and not json:
-            show(f"kept: merge-sumo replay {quoted(config.out)} --gui")
+            show(f"saved: merge-sumo replay {quoted(config.out)} --gui")
         if config.gui and not json:
             say("the replay is open in sumo-gui: close the window to end")
 
@@ -277,7 +296,7 @@ def _coordinates(words: Sequence[str]) -> dict[str, float]:
         try:
             values[name.strip()] = float(number)
         except ValueError:
-            raise UserError(f"--at {text}: give NAME=NUMBER, as x_pov0_m=-250") from None
+            raise UserError(f"--at {text}: give NAME=NUMBER, such as x_pov0_m=-250") from None
     return values
 
 
@@ -300,7 +319,7 @@ def report(config: Options[c.Report], *, json: Json = False) -> int:
 def replay(
     config: Options[c.ReplayCase],
     *,
-    gui: Annotated[bool, Parameter(help="Open it in sumo-gui.")] = False,
+    gui: Annotated[bool, Parameter(help="Open the case in sumo-gui.")] = False,
     json: Json = False,
 ) -> int:
     """Replay a case in SUMO and print the comparison, or open it in sumo-gui.
@@ -337,10 +356,10 @@ def rerun(
     stress: Annotated[
         bool,
         Parameter(
-            group=CASES,
-            help="Change the simulation and not the VUT: a shorter step, an actuator that lags, "
-            "limited power, a start that is off by the error of a sensor, longer cars. Failures "
-            "that fail every time are robust.",
+            help="""Keep the VUT and change the simulation. Failures that fail each time are robust.
+
+            The changes are a shorter step, an actuator with a lag, limited power, a start with the
+            error of a sensor, and longer cars.""",
         ),
     ] = False,
     json: Json = False,
@@ -361,7 +380,7 @@ def rerun(
         return print_result(result, json, **page)
     options = c.values_of(config, c.StudyOptions)
     if c.non_defaults(config, c.Rerun).keys() - options.keys() - {"run"}:
-        raise UserError("--stress runs all cases: leave indices, --level, --out and --junit away")
+        raise UserError("--stress runs all cases: omit indices, --level, --out and --junit")
     return print_result(ms.stress(config.run, **options), json)
 
 
@@ -409,12 +428,12 @@ def list_scenarios(*, json: Json = False) -> int:
 
 
 def _check_working_folder() -> None:
-    """Raise `UserError` where the working folder is gone: relative paths mean nothing then."""
+    """Raise `UserError` if the working folder does not exist: relative paths would mean nothing."""
     try:
         Path.cwd()
     except OSError as error:
         raise UserError(
-            f"the working folder cannot be read ({error.strerror}): change to another one"
+            f"cannot read the working folder ({error.strerror}): change to another one"
         ) from error
 
 
@@ -428,7 +447,7 @@ def execute(words: Sequence[str]) -> int:
         UserError: for bad use.
     """
     if words and words[0] in GONE:
-        raise UserError(f"the command {words[0]} is gone: {GONE[words[0]]}")
+        raise UserError(f"the command {words[0]} no longer exists: {GONE[words[0]]}")
     try:
         with notices_printed():
             return app(words) or 0
@@ -441,11 +460,12 @@ def execute(words: Sequence[str]) -> int:
 
 
 def main() -> None:
-    """Run the command line; a `UserError` becomes one sentence and exit code 2.
+    """Run the command line and exit.
 
-    So does an error of the system that has run out of something. What a signal stopped ends with
-    128 + its number. Any other error is a fault of this package, with an exit code of its own: 1,
-    which Python would give, means that a gate is met.
+    A `UserError` becomes one sentence and exit code 2, and so does an error of the system that has
+    run out of a resource. A command that a signal stops exits with 128 + the number of the signal.
+    Any other error is a bug in this package and has its own exit code. Exit code 1, which Python
+    would give, means that a gate is met.
     """
     prepare_streams()
     for library in ("OMP", "OPENBLAS", "MKL"):  # products are small, and the cores are for workers
@@ -470,7 +490,7 @@ def main() -> None:
             sys.exit(2)
         for line in traceback.format_exc().splitlines():
             say(line)
-        say("merge-sumo: this is a fault of merge-sumo and no result: report it with these lines")
+        say("merge-sumo: this is a bug in merge-sumo, not a result: report it with these lines")
         sys.exit(FAULT)
 
 

@@ -77,18 +77,24 @@ class Policies:
     """Drivers."""
 
     policies: AnyPath | None = None
-    """Folder of learned drivers, as `train --out DIR` makes it, or a shipped library such as human,
-    instead of the default ones."""
+    """Folder of learned drivers, or a shipped library such as human.
+
+    `merge-sumo train --out FOLDER` writes such a folder. By default each scenario has its own
+    learned drivers.
+    """
 
 
 @dataclass(frozen=True, kw_only=True)
 class Limits:
-    """Limits of a controller."""
+    """Limits of the user's controllers."""
 
     deadline_s: float | None = None
-    """Seconds that a controller may take for a step before it is a VUT_ERROR; 5 by default."""
+    """Seconds that the controller may take for one step. [default: 5]
+
+    A case whose controller takes longer ends as VUT_ERROR.
+    """
     vut_memory_gib: float | None = None
-    """GiB of memory that the process of a controller of your own may take; 4 by default."""
+    """Memory limit of the process of your controller. [default: 4]"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,7 +102,10 @@ class Drivers(Limits, Policies):
     """Drivers and limits of controllers."""
 
     pov: AnyVut | None = None
-    """A POV of your own, of any kind that --vut takes but traci: it drives at level own."""
+    """A POV of your own, which drives at level own.
+
+    It can be of any kind that --vut takes, except traci.
+    """
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -104,97 +113,133 @@ class FailureRule:
     """What counts as a failure."""
 
     fail_when: str | None = None
-    """What counts as a failure: paper (front bumpers within 6 m at the merge), unsafe, contact, or
-    a condition over the measures of outcomes.jsonl: 'ttc_s < 1.5 or end == "TIMEOUT"'. By default
-    that of the scenario: paper where M is a point, unsafe on a lane."""
+    """What counts as a failure: paper, contact, unsafe, or a condition over measures, such as
+    'ttc_s < 1.5'. [default: as in the scenario]
+
+    - paper: the front bumpers are within 6 m of each other when the VUT reaches the merge point M
+    - contact: the bodies of two vehicles overlap
+    - unsafe: a contact, or the rear vehicle must brake harder than 3 m/s2 after the merge
+
+    A condition may name every measure of outcomes.jsonl: 'ttc_s < 1.5 or end == "TIMEOUT"'. The
+    default is paper where the road has a merge point, and unsafe where it has an acceleration lane.
+    """
     require: str | None = None
-    """Requirement over time, instead of --fail-when, in signal temporal logic:
-    'always ((x_vut_m > -20) implies (bumper_gap_m > 2))'. Needs the extra stl."""
+    """Requirement over time in signal temporal logic, not with --fail-when.
+
+    A case fails if it violates the formula, such as 'always ((x_vut_m > -20) implies (bumper_gap_m
+    > 2))'. It needs the extra stl: pip install 'merge-sumo[stl]'.
+    """
 
 
 @dataclass(frozen=True, kw_only=True)
 class ScenarioChanges:
-    """Changes of a scenario."""
+    """Settings that replace those of the scenario."""
 
     follow_up_s: float | None = None
-    """Seconds for which all drive on after the merge; 0 ends an episode there. By default 3,
-    and 5 on an acceleration lane."""
+    """Seconds simulated after the merge. [default: 3, on a lane 5]
+
+    With 0 an episode ends at the merge. The default is 3, and 5 on an acceleration lane.
+    """
     sense: AnySensing | None = None
-    """How the VUT senses other cars: delay_s, noise_x_m, noise_v_mps, dropout, range_m,
-    occluded_until_m, as NAME=NUMBER,...; a range, as delay_s=0..0.5, is tested as a whole."""
+    """Errors of the sensors of the VUT, such as delay_s=0.3,noise_x_m=1.
+
+    The names are delay_s, noise_x_m, noise_v_mps, dropout, range_m and occluded_until_m. A range,
+    such as delay_s=0..0.5, becomes a coordinate of the cases: the sampler chooses a value for each
+    case.
+    """
     act: AnyActuation | None = None
-    """How the VUT obeys its controller: lag_s, delay_s, power_w_per_kg; with ranges as --sense."""
+    """Errors of the actuators of the VUT, such as lag_s=0.3,delay_s=0.1.
+
+    The names are lag_s, delay_s and power_w_per_kg. A range is searched as with --sense.
+    """
 
 
 @dataclass(frozen=True, kw_only=True)
-class Test(ScenarioChanges, FailureRule, Drivers):
-    """What is tested."""
+class Test(Drivers, ScenarioChanges, FailureRule):
+    """The scenario and the rules of a test."""
 
     scenario: AnyScenario | None = None
-    """Scenario that `merge-sumo scenario list` names, or a TOML file of your own, which
-    `merge-sumo scenario new` writes; us23 by default."""
+    """Scenario: a name that `merge-sumo scenario list` prints, or your own TOML file. [default:
+    us23]
+
+    `merge-sumo scenario new` writes such a file.
+    """
 
 
 @dataclass(frozen=True, kw_only=True)
 class Search:
-    """Which cases run."""
+    """How a campaign chooses its cases."""
 
     sampler: str = "coverage"
-    """Sampler that proposes the cases: coverage, gpr, subset, annealing or uniform."""
+    """Sampler, which chooses the cases: coverage, gpr, subset, annealing or uniform."""
     cases: int | None = None
-    """Number of cases; by default until the search has converged, at most 800."""
+    """Number of cases. [default: until the search converges, at most 800]"""
     batch: int | None = None
-    """Cases per batch; by default the number that the sampler wants."""
+    """Cases per batch. [default: chosen by the sampler]"""
     in_flight: int | None = None
-    """Maximum number of cases that run or wait for a worker while the sampler proposes more,
-    instead of batches: for controllers that take seconds for a case. About three times the
-    workers."""
+    """Keep up to this many cases running or waiting, without batches.
+
+    This suits controllers that take seconds for a case: the sampler proposes more cases while
+    others run. About three times the number of workers is a good value.
+    """
     repeat: int = 1
-    """Number of runs of each case. They differ by the seed that a controller gets, and by the noise
-    and dropouts of --sense; else all are alike. Each run is one of the --cases."""
+    """Runs of each case, if controller or sensors are random.
+
+    The runs of a case differ by the seed that the controller gets, and by the noise and the
+    dropouts of --sense. Without these, all runs are alike. Each run counts as one of the --cases.
+    """
     tolerated: float = 0.0
-    """A case fails where more than this share of its runs do."""
+    """A case fails if more than this share of its runs fail."""
     seed: int = 0
-    """Seed of random numbers: same seed, same outcomes."""
+    """Random seed. The same seed gives the same outcomes."""
     stop_when_converged: bool = False
-    """Stop before --cases when the last 100 cases have added less than 1 % to the coverage."""
+    """Stop as soon as the search has converged, before --cases.
+
+    It has converged when the last 100 cases have added less than 1 % to the coverage.
+    """
 
 
 @dataclass(frozen=True, kw_only=True)
 class Execution:
-    """Where it runs."""
+    """How cases are run."""
 
     workers: int | str | None = 1
-    """Processes that run cases, auto for one a core (one in all for a campaign of up to 1,000 cases
-    of built-in drivers), or a Dask scheduler, tcp://HOST:PORT; the outcomes are the same. By
-    default auto for a command, and 1 in Python."""
+    """Number of worker processes, auto, or a Dask scheduler, tcp://HOST:PORT. [default: auto]
+
+    auto starts one per core. A campaign of up to 1,000 cases with built-in drivers uses one
+    process. The number does not change the outcomes. On the command line the default is auto, in
+    Python it is 1.
+    """
     progress: bool | None = None
-    """Show progress; by default in a notebook and on a terminal."""
+    """Show progress, or hide it. [default: shown in terminals and notebooks]"""
 
 
 @dataclass(frozen=True, kw_only=True)
 class StudyOptions(Execution, Drivers):
-    """How a study runs cases of a recorded campaign."""
+    """Settings of a study that runs cases of a recorded campaign."""
 
     vut: AnyVut | None = None
-    """Vehicle under test, perhaps a changed one. A file, module, command or model is always named
-    here: a run folder names no code to run."""
+    """The VUT, if it has changed or is your own code. [default: as in the campaign]
+
+    A run folder does not name code to run. If the VUT of the campaign was a file, a module, a
+    command or a model, name it again.
+    """
 
 
 @dataclass(frozen=True, kw_only=True)
 class Junit:
-    """A file for CI."""
+    """A report for CI."""
 
     junit: AnyPath | None = None
-    """New file to write for CI: JUnit XML (.xml)."""
+    """New JUnit XML file (.xml) for CI."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Page(Junit):
-    """Files of a comparison."""
+    """Files that a comparison writes."""
 
     out: AnyPath | None = None
-    """New page (.html) to write: what changed, and each such case with both motions."""
+    """New page (.html) that shows the changed cases and both motions of each."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -202,37 +247,49 @@ class Levels:
     """Levels of the POV."""
 
     level: AnyLevels = "all"
-    """POV levels: 0, 1, 2, own, several with commas, or all."""
+    """POV levels: 0, 1, 2 or own, or several with commas.
+
+    Level 0 ignores the VUT. Level 1 makes room for a VUT that accelerates. Level 2 expects a VUT
+    that reacts. own is the driver of --pov.
+    """
 
 
 @dataclass(frozen=True, kw_only=True)
 class EngineChoice:
-    """What moves the vehicles."""
+    """The engine that moves the vehicles."""
 
     engine: str | None = None
-    """kinematic: the equations of motion alone, and SUMO for at least one case of a hundred; or
-    sumo for all. By default kinematic where VUT and POV are of this package."""
+    """Engine: kinematic or sumo. [default: kinematic, if the drivers allow]
+
+    kinematic solves the equations of motion without SUMO, and runs at least one case in a hundred
+    in SUMO to compare. It needs a VUT and a POV of this package. sumo runs all cases in SUMO.
+    """
 
 
 @dataclass(frozen=True, kw_only=True)
 class Beginning:
-    """From when on a case is shown."""
+    """The part of a case that is shown."""
 
     from_s: float | None = None
-    """Begin so long before the first conflict, as in -3: contact, else lowest TTC, merge, end."""
+    """Start relative to the first conflict, such as -3.
+
+    The first conflict is the contact. Without a contact it is the lowest time to collision or the
+    merge, and without a merge it is the end of the case.
+    """
 
 
 # Search
 
 
 @dataclass(frozen=True, kw_only=True)
-class CampaignOptions(Levels, Junit, Execution, Search, Test):
-    """Test a VUT: run cases in SUMO, find failures, write a report and replayable scenarios.
+class CampaignOptions(Execution, Junit, Test, Search, Levels):
+    """Test a VUT: run cases in SUMO, find failures, and write a report.
 
-    Ctrl-C ends after the running batch and prints how to continue; twice stops at once.
+    The run folder also contains the worst failures as scenarios that `replay` can show. Ctrl-C ends
+    the campaign after the running batch and prints how to continue. A second Ctrl-C stops at once.
 
-    Exit code 1 when a --gate is met, and always when the VUT merged in no case: then nothing was
-    tested. 2 for bad use, 130 or 143 when it was stopped, else 0.
+    Exit codes: 0 finished, 1 a --gate is met or the VUT merged in no case, 2 wrong usage, 130 or
+    143 stopped.
 
     Example:  merge-sumo campaign --vut design1 --level 0 --cases 400 --seed 1
 
@@ -240,94 +297,102 @@ class CampaignOptions(Levels, Junit, Execution, Search, Test):
     """
 
     against: AnyVut | None = None
-    """An earlier version of the VUT, of any kind but a client that connects by itself (traci or
-    traci:PORT): each case runs with both, and the sampler looks for those that the VUT alone
-    fails."""
+    """Earlier version of the VUT. Both drive each case, and the sampler searches for cases that
+    only the new version fails.
+
+    It can be of any kind except traci and traci:PORT, clients that connect by themselves.
+    """
     gates: Iterable[str] = ()
-    """Exit with 1 if there are failures, errors, timeouts, "fmc>X": an FMC above X at some level,
-    or, with --against, regressions. May be given several times."""
+    """Exit with 1 for failures, errors, timeouts, regressions, or "fmc>X".
+
+    The option may be given several times. "fmc>X" is met if the FMC at some level is above X.
+    regressions needs --against.
+    """
 
 
 @dataclass(frozen=True, kw_only=True)
 class CampaignCalls(CampaignOptions):
-    """A campaign with functions that it calls."""
+    """Functions that a campaign calls."""
 
     on_case: Callable[[Outcome], None] | None = None
-    """Called with the outcome of every case as it ends."""
+    """Function that is called with the outcome of each case when it ends."""
     check: Callable[[], None] | None = None
-    """Called after every batch; may raise to stop there."""
+    """Function that is called after each batch. It may raise an exception to stop there."""
 
 
 @dataclass(frozen=True)
 class Campaign(CampaignCalls):
-    """Test a VUT and return the campaign, also one without failures."""
+    """Test a VUT and return the campaign, whether or not cases fail."""
 
     vut: AnyVut
-    """Vehicle under test: a spec as after --vut, a class, a function, or an object."""
+    """Vehicle under test: a spec as for --vut, a class, a function, or an object."""
     _: KW_ONLY
     out: AnyPath | None = None
-    """New folder to write; runs/VUT-DATE by default."""
+    """New folder to write. [default: runs/VUT-DATE]"""
 
 
 @dataclass(frozen=True)
 class NoFailures(Campaign):
-    """Test a VUT in a campaign, and raise `AssertionError` where a case fails or ends in an error.
+    """Test a VUT in a campaign, and raise `AssertionError` if a case fails or ends in an error.
 
-    The message names the counts, the worst case, the report, and the command that replays the
-    case. A timeout is not a failure, unless `fail_when` says so. Returns the campaign.
+    The message gives the counts, the worst case, the report, and the command that replays the case.
+    A timeout is not a failure, unless `fail_when` makes it one. Returns the campaign.
     """
 
     _: KW_ONLY
     cases: int = 200
-    """Number of cases: seconds for a controller that answers at once."""
+    """Number of cases. A fast controller takes seconds for 200."""
 
 
 @dataclass(frozen=True)
 class Resume(CampaignCalls):
-    """Continue a campaign that was stopped; the same as `merge-sumo campaign --resume`.
+    """Continue a campaign that was stopped, as `merge-sumo campaign --resume` does.
 
-    The settings must be those of the campaign: `cases` may be more. A VUT, `pov` or `against` that
-    is code is given again: a run folder names no code to run. Of an object only its name tells that
-    it is the same.
+    The settings must be those of the campaign, except that `cases` may be larger. A VUT, a `pov` or
+    an `against` that is code must be given again, because a run folder does not name code to run.
+    Of an object only the name is compared.
     """
 
     run: AnyRun
     """The campaign, or its folder."""
     _: KW_ONLY
     vut: AnyVut | None = None
-    """The VUT again, where it is code of your own."""
+    """The VUT again, if it is your own code."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class CaseOptions(Beginning, Test):
-    """Run one case and show what happens: verdict, measures, and the motion second by second.
+    """Run one case and print its result, its measures and its motion.
 
-    Exit code 0 when the case passes, 1 when it fails, errs or times out, 2 for bad use. With --gui
-    its replay opens in sumo-gui when it has ended; --from begins table and window later.
+    Exit codes: 0 the case passes, 1 it fails, ends in an error or times out, 2 wrong usage.
 
     Example:  merge-sumo run --vut design2 --level 2 --x -298.6 --v 34.5 --psi 0.62
     """
 
     level: int | str | None = None
-    """POV level: 0, 1, 2 or own; by default 0, or that of the recorded case."""
+    """POV level: 0, 1, 2 or own. [default: 0]
+
+    With --case the default is the level of the recorded case.
+    """
     x_pov0_m: float | None = None
-    """Initial position of the POV in m; M is 0."""
+    """Start of the POV: position of its front bumper. The merge point is at 0."""
     v_pov0_mps: float | None = None
-    """Initial speed of the POV in m/s."""
+    """Start of the POV: its speed."""
     svo_rad: float | None = None
-    """Social value orientation of the POV in rad, at level 2."""
+    """Social value orientation of the POV at level 2: 0 is egoistic, pi/2 altruistic."""
     headway_ahead_s: float | None = None
-    """Headway to the car ahead in s, in traffic."""
+    """Time headway of the POV to the car ahead, in traffic."""
     headway_behind_s: float | None = None
-    """Headway of the car behind in s, in traffic."""
+    """Time headway of the car behind the POV, in traffic."""
     debug: bool = False
-    """Run the VUT in this process without a deadline: breakpoints work."""
+    """Run the VUT in this process without a deadline, for breakpoints."""
     gui: bool = False
-    """Show its replay in sumo-gui when it has ended."""
+    """Open the replay in sumo-gui when the case has ended."""
     out: AnyPath | None = None
-    """New folder to keep it in, for `replay` and sumo-gui."""
+    """New folder for the case, which `replay` and sumo-gui can show."""
     recorded: tuple[AnyRun, int] | None = None
-    """A campaign, or its folder, and the index of its case: default of everything else."""
+    """A case of a campaign: its folder and the index. Its values are the defaults of all other
+    options."""
 
 
 COORDINATE_OPTIONS = ("x_pov0_m", "v_pov0_mps", "svo_rad", "headway_ahead_s", "headway_behind_s")
@@ -339,25 +404,24 @@ class RunCase(CaseOptions):
     """Run one case and return it."""
 
     vut: AnyVut | None = None
-    """Vehicle under test; by default that of the recorded case."""
+    """Vehicle under test. [default: that of the recorded case]"""
     case: Mapping[str, Any] | None = None
-    """A row of `run.cases` or `run.failures`: default of level and coordinates."""
+    """A row of `run.cases` or `run.failures`: its level and coordinates are the defaults."""
     _: KW_ONLY
     at: Mapping[str, float] | None = None
-    """Any coordinate of the case, by its name in outcomes.jsonl."""
+    """Coordinates of the case by their names in outcomes.jsonl."""
     on_end: Callable[[Any], None] | None = None
-    """Called with the result when the case has ended, before a window is closed."""
+    """Function that is called with the result when the case has ended, before a window closes."""
 
 
 @dataclass(frozen=True)
 class Probability(EngineChoice, StudyOptions):
-    """Estimate how likely a VUT is to fail, with an interval that is valid.
+    """Estimate the failure probability of a VUT, with a valid confidence interval.
 
-    The cases of the campaign were chosen to fail: they only say where failures are expected. Fresh
-    cases are drawn independently from where they are and from where they are not, and the interval
-    is exact, however wrong the expectation is. What fails where nothing was expected to, the
-    campaign has missed. Where VUT and POV are of this package, the equations of motion run them
-    without SUMO, except for one of a hundred.
+    The cases of the campaign were chosen to fail, so their share of failures is not a probability.
+    They show where failures are expected. merge-sumo draws new cases from there and, separately,
+    from the rest. The interval is exact even if the expectation is wrong. Failures in the rest are
+    failures that the campaign has missed.
 
     Example:  merge-sumo probability runs/design2
 
@@ -368,18 +432,20 @@ class Probability(EngineChoice, StudyOptions):
     """The campaign, or its folder."""
     _: KW_ONLY
     cases: int | None = None
-    """Fresh cases to run; by default 100000 without SUMO, 4000 in it."""
+    """Number of new cases. [default: 100000, in SUMO 4000]"""
     traffic: AnyPath | None = None
-    """State the failures per merge in a traffic: exid-2, exid-3, exid-5, or a TOML file with
-    density and speeds."""
+    """Also estimate failures per merge in traffic: exid-2, exid-3, exid-5, or a TOML file.
+
+    The file contains the density and the speeds of the traffic.
+    """
     distribution: AnyPath | None = None
-    """JSON: how often cases occur; uniformly by default."""
+    """How often each case occurs, as JSON. [default: uniform]"""
     confidence: float = 0.95
-    """Chance that the interval holds the probability."""
+    """Probability that the interval contains the true value."""
     seed: int = 0
-    """Seed of random numbers: same seed, same cases."""
+    """Random seed. The same seed gives the same cases."""
     out: AnyPath | None = None
-    """New file (.json) to write; RUN/probability.json by default."""
+    """New file (.json) to write. [default: RUN/probability.json]"""
 
 
 # Look
@@ -387,12 +453,12 @@ class Probability(EngineChoice, StudyOptions):
 
 @dataclass(frozen=True)
 class Explain(StudyOptions):
-    """Say why a failure fails: the smallest change of one thing with which it passes.
+    """Explain a failure: find the smallest change of one value with which the case passes.
 
-    Each coordinate of the start, the level of the POV and each named parameter changes by itself:
-    cases with other values run, and each value that is printed runs a second time. A campaign
-    explains its worst failure, without parameters, if the VUT is of this package. `report` shows
-    all failures that were explained.
+    merge-sumo changes one value at a time: a coordinate of the start, the level of the POV, or a
+    parameter of the controller. It runs the case with other values, and runs each printed value
+    twice. A campaign explains its worst failure by itself, without parameters, if the VUT is of
+    this package. `report` shows all failures that were explained.
 
     Example:  merge-sumo explain runs/design1
     """
@@ -400,16 +466,15 @@ class Explain(StudyOptions):
     run: AnyRun
     """The campaign, or its folder."""
     case: int | None = None
-    """Index of the failure in outcomes.jsonl; the worst by default."""
+    """Index of the failure in outcomes.jsonl. [default: the worst failure]"""
     _: KW_ONLY
     params: Iterable[str] = ()
-    """A parameter of the controller, NAME=LOW..HIGH, and the range in which the nearest value that
-    passes is searched. May be given several times."""
+    """Parameter of the controller and the range that is searched. May be given several times."""
 
 
 @dataclass(frozen=True)
 class Export:
-    """Write cases of a campaign for SUMO, for other simulators, as a table, or to commit.
+    """Write cases of a campaign as scenarios, as a table, or as a file for `rerun`.
 
     Example:  merge-sumo export runs/design2 17 42
     """
@@ -417,37 +482,48 @@ class Export:
     run: AnyRun
     """The campaign, or its folder."""
     indices: Indices | None = None
-    """Cases of the campaign; csv: all by default, cases: 40 that watch a VUT."""
+    """Indices of the cases. [default: all for csv, up to 40 for cases]
+
+    For sumo and openscenario name at least one. Without indices, cases writes those that show
+    changes of a VUT best.
+    """
     _: KW_ONLY
     file_format: str = "sumo"
-    """sumo: folders that sumo-gui replays. openscenario: folders with OpenSCENARIO and OpenDRIVE.
-    csv: one table of motion. cases: one small TOML file to commit, for rerun."""
+    """What to write: sumo, openscenario, csv or cases.
+
+    - sumo: folders that sumo-gui replays
+    - openscenario: folders with OpenSCENARIO and OpenDRIVE
+    - csv: one table of the motion
+    - cases: one small TOML file to commit, which `rerun` reads
+    """
     out: AnyPath | None = None
-    """Folder, or FILE.csv or FILE.toml for one file; by default RUN/scenarios for sumo, else
-    RUN/exports."""
+    """New folder, or FILE.csv, or FILE.toml. [default: RUN/scenarios for sumo, else RUN/exports]"""
 
 
 @dataclass(frozen=True)
 class ReplayCase(Beginning):
-    """Replay a scenario in SUMO and check every position and speed against its record.
+    """Replay a recorded case in SUMO and compare each position and speed with the record.
 
-    A case of a campaign is exported first. Says what happened, then "identical" (exit code 0) or
-    "diverged at t = ..." (exit code 1).
+    A case of a campaign is exported first. The command prints the motion, then "identical" or
+    "diverged at t = ...".
+
+    Exit codes: 0 identical, 1 diverged, 2 wrong usage.
 
     Example:  merge-sumo replay scenarios/stalemate --gui --from -3
     """
 
     folder: AnyRun
-    """A scenario folder, or a campaign, or its folder."""
+    """A scenario folder, or a campaign or its folder."""
     index: int | None = None
-    """Index of the case of the campaign in outcomes.jsonl."""
+    """Index of the case in outcomes.jsonl, for a campaign."""
 
 
 @dataclass(frozen=True)
 class Report:
     """Write the report of a campaign again and print its path.
 
-    With --json each of its facts is printed, with the file and the key that it is from.
+    With --json the command prints each fact of the report, with the file and the key that it comes
+    from.
 
     Example:  merge-sumo report runs/design2
     """
@@ -461,18 +537,20 @@ class Report:
 
 @dataclass(frozen=True)
 class Rerun(Page, Levels, StudyOptions):
-    """Run recorded cases again with a changed VUT, and say which broke and which are fixed.
+    """Run recorded cases again with a changed VUT, and list which broke and which are fixed.
 
-    The cases are those of the old version's search: `campaign --against` searches where the new one
-    alone fails.
+    The cases are those that the campaign recorded. To search for cases that only the new version
+    fails, use `campaign --against`.
 
-    Exit code 1 when a case broke: it passed, and does not pass now. A cases file of `export` may
-    stand in the place of the campaign. Then what changed in the file is shown, `out` is the file as
-    it is now, and the exit code is 1 also for a new error or contact, and for a margin that drops
-    by more than the `tolerance` of a file that has one.
+    A cases file of `export --format cases` can replace the campaign. Then --out writes the updated
+    file.
 
-    With a controller that others wrote, a case that changed runs a second time. Where that does not
-    repeat, the case is "not repeatable", and is not counted by itself.
+    With a controller that is not built in, each changed case runs a second time. If the second
+    result differs, the case is "not repeatable" and does not count.
+
+    Exit codes: 0 no case broke, 1 a case broke: it passed and does not pass now, 2 wrong usage.
+    With a cases file also 1 for a new error or contact, or a margin that drops by more than the
+    tolerance.
 
     Example:  merge-sumo rerun runs/design2 3 7 --vut design2 --out changes.html
 
@@ -484,14 +562,14 @@ class Rerun(Page, Levels, StudyOptions):
     run: AnyRun
     """The campaign, its folder, or a cases file."""
     indices: Indices = ()
-    """Cases of the campaign; all of them by default."""
+    """Indices of the cases. [default: all cases]"""
 
 
 @dataclass(frozen=True)
 class Stress(StudyOptions):
-    """Measure how results change with the simulation; the same as `merge-sumo rerun --stress`.
+    """Measure how results change with the simulation, as `merge-sumo rerun --stress` does.
 
-    `robust` of the result has the failures that fail every time, the worst first.
+    `robust` of the result lists the failures that fail every time, the worst first.
     """
 
     run: AnyRun
@@ -502,11 +580,14 @@ class Stress(StudyOptions):
 class Compare(Page):
     """Compare recorded versions of a VUT: broken and fixed cases.
 
-    Everything is read from the records. Cases that two campaigns share are paired; where each has
-    cases of its own, the shares of cases that pass are compared.
+    The command runs no cases. It pairs the cases that two campaigns share. If each campaign has its
+    own cases, it compares the shares of cases that pass.
 
-    Exit code 1 when a case broke, when a version passes in a smaller share of its own cases than
-    the one before it, by Fisher's exact test, or when the last version was tested in no case.
+    Exit codes: 0 nothing got worse, 2 wrong usage, 1 if one of these is true:
+
+    - a case broke
+    - a version passes a smaller share of its own cases than the one before (Fisher's exact test)
+    - the last version was tested in no case
 
     Example:  merge-sumo compare runs/design1 runs/design2 --out changes.html
     """
@@ -520,7 +601,7 @@ class Compare(Page):
 
 @dataclass(frozen=True, kw_only=True)
 class Vuts(Policies):
-    """List the vehicles that can be tested: by name, and the kinds that you can bring.
+    """List the vehicles under test: the built-in ones, and the kinds that you can bring.
 
     Example:  merge-sumo vuts
     """
@@ -528,23 +609,23 @@ class Vuts(Policies):
 
 @dataclass(frozen=True)
 class CheckVut(Limits, Policies):
-    """Let a VUT drive a few cases, and print its faults and the cost of a step.
+    """Check a VUT in a few cases: list its errors and the time that it takes for a step.
 
-    Says "nothing wrong" (exit code 0), or names the faults in sentences (exit code 1).
+    Exit codes: 0 "nothing wrong", 1 the command lists errors, 2 wrong usage.
 
     Example:  merge-sumo check-vut design1
     """
 
     vut: AnyVut
-    """Vehicle under test, as after --vut."""
+    """Vehicle under test, as in `campaign`."""
     _: KW_ONLY
     scenario: AnyScenario | None = None
-    """Scenario to drive in, or a TOML file of one; us23 by default."""
+    """Scenario of the check: a name, or your own TOML file. [default: us23]"""
 
 
 @dataclass(frozen=True)
 class Scenarios:
-    """List the scenarios that the package brings.
+    """List the shipped scenarios.
 
     Example:  merge-sumo scenario list
     """
@@ -552,10 +633,10 @@ class Scenarios:
 
 @dataclass(frozen=True)
 class NewScenario:
-    """Write a scenario for a merge in a net of your own, with a suggested pool.
+    """Write a scenario for a merge in your own net, with a suggested pool of starts.
 
-    On a ramp with an acceleration lane the VUT chooses on it where to merge.
-    A picture of the road is written next to it, as SVG.
+    If the ramp has an acceleration lane, the VUT chooses where on the lane it merges. The command
+    also writes a picture of the road (.svg).
 
     Example:  merge-sumo scenario new my-ramp.toml --net my.net.xml --mainline "a b" --ramp "r b"
     """
@@ -564,18 +645,18 @@ class NewScenario:
     """New TOML file to write."""
     _: KW_ONLY
     net: AnyPath
-    """SUMO net: NAME.net.xml[.gz]."""
+    """SUMO net: NAME.net.xml or NAME.net.xml.gz."""
     mainline: str
-    """Edges of the mainline, past M: "e1 e2"."""
+    """Edges of the mainline, up to and past the merge point: "e1 e2"."""
     ramp: str
-    """Edges of the ramp, past M: "r1 e2"."""
+    """Edges of the ramp, up to and past the merge point: "r1 e2"."""
     point: bool = False
-    """Make M a point, also where the ramp has an acceleration lane."""
+    """Merge at a point, even if the ramp has an acceleration lane."""
 
 
 @dataclass(frozen=True)
 class CheckScenario(Policies):
-    """Check that a scenario can be hosted, and that the learned drivers were trained on it.
+    """Check that a scenario can run, and whether the learned drivers were trained on it.
 
     Example:  merge-sumo scenario check us23
     """
@@ -588,29 +669,29 @@ class CheckScenario(Policies):
 class Train:
     """Train the learned drivers, level by level, and measure their regret in SUMO.
 
-    The regret is the loss of a driver against its best response, as a share of the gain of the best
-    response over level-0 behaviour. An interrupted training continues.
+    The regret of a driver is its loss against its best response. It is a share of the gain of the
+    best response over level-0 behaviour. A training that was stopped continues.
 
     Example:  merge-sumo train --out my-policies --seed 1
     """
 
     only: Iterable[str] | None = None
-    """Network to train: pov1, vut1, pov2 or vut2; all by default."""
+    """Networks to train: pov1, vut1, pov2 or vut2. [default: all]"""
     _: KW_ONLY
     seed: int = 0
-    """Seed of random numbers: same seed, same weights on one machine."""
+    """Random seed. The same seed gives the same weights on one machine."""
     scenario: AnyScenario | None = None
-    """Scenario, or a TOML file of one; us23 by default."""
+    """Scenario to train on: a name, or your own TOML file. [default: us23]"""
     out: AnyPath | None = None
-    """Folder to write; by default the shipped policies, for us23 only."""
+    """Folder to write. [default: the shipped policies, for us23 only]"""
     a_min: float | None = None
-    """Hardest braking of the POVs in m/s2, below 0, such as -2; by default that of the scenario."""
+    """Hardest braking of the POVs, such as -2. [default: as in the scenario]"""
     check: bool = False
-    """Train nothing: measure the regret of the networks in the folder."""
+    """Measure the regret of the networks in the folder, without training."""
     cases: int = 300
-    """Random cases of a check."""
+    """Number of random cases of a check."""
     progress: bool | None = None
-    """Show progress; by default in a notebook and on a terminal."""
+    """Show progress, or hide it. [default: shown in terminals and notebooks]"""
 
 
 # Research
@@ -618,73 +699,79 @@ class Train:
 
 @dataclass(frozen=True)
 class GroundTruth(EngineChoice, Execution, Test):
-    """Find the ground truth of a VUT at each level, by uniform cases on all cores.
+    """Find the ground truth of a VUT: run uniform cases at each level.
 
-    It is kept in a cache (MERGE_SUMO_CACHE, or the user's cache folder) under a hash of all inputs,
-    and used again while all files that the VUT has loaded are the same. The output says how many
-    cases SUMO has run where the kinematic engine ran the others. The truth of an object of a Python
-    process is not kept: its name does not tell it from another object.
+    merge-sumo keeps the result in a cache (MERGE_SUMO_CACHE, or the cache folder of the user) and
+    reads it again if no input has changed. The inputs include all files that the VUT has loaded.
+    The result for an object of a Python process is not kept. If the kinematic engine ran the cases,
+    the output shows how many of them SUMO repeated.
 
     Example:  merge-sumo truth --vut design2 --level 1 --cases 10000
     """
 
     vut: AnyVut
-    """Vehicle under test: a spec as after --vut, a class, a function, or an object."""
+    """Vehicle under test, as in `campaign`.
+
+    In Python also a class, a function or an object.
+    """
     level: AnyLevels = "all"
-    """POV levels: 0, 1, 2, own, several with commas, or all."""
+    """POV levels: 0, 1, 2 or own, or several with commas."""
     _: KW_ONLY
     cases: int | None = None
-    """Uniform cases of a level; by default 10000, at level 2 20000."""
+    """Uniform cases per level. [default: 10000, at level 2 20000]"""
     seed: int = 0
-    """Seed of random numbers: same seed, same cases."""
+    """Random seed. The same seed gives the same cases."""
 
 
 @dataclass(frozen=True)
 class Benchmark(Execution, Test):
     """Compare samplers with each other and with the ground truth, over several seeds.
 
-    With all levels, each run shares its cases out over them, and coverage is summed over them.
-    The truth of the paper's size misses places that searches find, so coverage is also shown as a
-    share of a limit: the coverage of all that truth and searches found together, or that of
-    1,000,000 uniform cases, if `truth --cases 1000000` has run, whichever is more.
+    With all levels, each run divides its cases among the levels, and the coverage is their sum. The
+    ground truth misses places that searches find. The command therefore also prints the coverage as
+    a share of a limit. The limit is the coverage of all cases together, or the coverage of
+    1,000,000 uniform cases if it is larger and `truth --cases 1000000` has run.
 
     Example:  merge-sumo benchmark --vut design1 --level 0 --samplers uniform,gpr --seeds 3
     """
 
     vut: AnyVut
-    """Vehicle under test: a spec as after --vut, a class, a function, or an object."""
+    """Vehicle under test, as in `campaign`.
+
+    In Python also a class, a function or an object.
+    """
     level: AnyLevels = "all"
-    """POV levels: 0, 1, 2, own, several with commas, or all."""
+    """POV levels: 0, 1, 2 or own, or several with commas."""
     _: KW_ONLY
     samplers: Names | None = None
-    """Names of samplers, separated by commas; all by default."""
+    """Names of samplers, separated by commas. [default: all]"""
     seeds: int = 10
-    """Runs of each sampler."""
+    """Number of runs of each sampler."""
     cases: int = 400
-    """Cases of each run."""
+    """Number of cases of each run."""
     batch: int | None = None
-    """Cases per batch; by default what coverage wants, and 20 for the others."""
+    """Cases per batch. [default: 20, for coverage its own]"""
     truth_cases: int | None = None
-    """Cases of the truth; by default 10000, at level 2 20000."""
+    """Cases of the ground truth. [default: 10000, at level 2 20000]"""
     figure: AnyPath | None = None
-    """New file for FMC against cases: .png or .svg."""
+    """New figure of the FMC over the cases (.png or .svg)."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Reproduce(Execution, Policies):
-    """Reproduce the paper: Table II and every figure of its results, with the paper's numbers.
+    """Reproduce Table II and all figures of the results of the paper, next to its numbers.
 
-    Writes table2.md, table2.json, the figures as PNG, and index.html that shows it all.
+    The command writes table2.md, table2.json, the figures (.png), and index.html with all of them.
 
     Example:  merge-sumo reproduce --seeds 10 --out reproduction
     """
 
     seeds: int | None = None
-    """Runs of each sampler; by default 10, with --quick 2."""
+    """Number of runs of each sampler. [default: 10, with --quick 2]"""
     out: AnyPath | None = None
-    """New folder to write; runs/reproduce-DATE by default."""
+    """New folder to write. [default: runs/reproduce-DATE]"""
     quick: bool = False
-    """Few and short runs and a small truth: a first look."""
+    """Get a first look: few and short runs, and a small ground truth."""
 
 
 def values_of(config: object, kind: type[Any]) -> dict[str, Any]:

@@ -144,12 +144,6 @@ def test_replay_prints_exactly_one_json_object(call, scenario):
 
 
 class TestHelp:
-    @pytest.mark.parametrize("name", COMMANDS)
-    def test_of_every_command_has_an_example_of_that_command(self, name):
-        result = invoke(name, "--help")
-        assert result.exit_code == 0
-        assert f"Example: merge-sumo {name}" in " ".join(result.output.split())
-
     def test_says_how_to_start_and_names_every_command_and_the_version(self):
         said = invoke("--help").output
         assert invoke("-h").output == said

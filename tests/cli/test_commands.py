@@ -39,11 +39,13 @@ def test_sixteen_commands_stand_in_five_panels():
 
 class TestOptions:
     @pytest.mark.parametrize("name", COMMANDS)
-    def test_all_have_a_group_and_a_text(self, name):
-        for argument in COMMANDS[name].assemble_argument_collection(parse_docstring=True):
-            if argument.parse and argument.keys:
-                assert argument.parameter.group, argument.name
-                assert argument.parameter.help, argument.name
+    def test_fit_in_70_lines_and_all_but_the_most_used_have_one_line(self, name, monkeypatch):
+        monkeypatch.setenv("COLUMNS", "100")
+        shown = invoke(*name.split(), "--help").output
+        assert shown.count("\n") <= 70
+        assert f"Example:  merge-sumo {name}" in shown
+        for line in shown.split("More options")[1].splitlines()[1:-1]:
+            assert re.match(r"│ --.*\S {2,}\w", line)
 
     @pytest.mark.parametrize(
         ("name", "flags"),

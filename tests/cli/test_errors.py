@@ -95,5 +95,5 @@ def test_a_fault_of_ours_is_a_traceback_and_no_result(monkeypatch, command_line,
     assert (code, out) == (cli.FAULT, "")
     assert err.startswith("Traceback (most recent call last):\n")
     assert f"{type(error).__name__}" in err
-    assert err.endswith("this is a fault of merge-sumo and no result: report it with these lines\n")
+    assert err.endswith("this is a bug in merge-sumo, not a result: report it with these lines\n")
     assert "\x1b" not in err

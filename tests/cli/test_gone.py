@@ -14,7 +14,9 @@ NAMES = {name.split()[0] for name in commands()}
 
 def test_a_command_that_is_gone_names_its_successor(monkeypatch):
     monkeypatch.setattr(cli, "GONE", {"old": "`new` does it"})
-    assert str(invoke("old", "runs/a").exception) == "the command old is gone: `new` does it"
+    assert (
+        str(invoke("old", "runs/a").exception) == "the command old no longer exists: `new` does it"
+    )
 
 
 @pytest.mark.parametrize("name", cli.GONE)
