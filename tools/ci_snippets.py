@@ -1,11 +1,11 @@
 """Write the files and the script of docs/how-to/ci.md for the CI of a controller.
 
 python tools/ci_snippets.py github FOLDER    the commands of the GitHub workflow, one per line
-python tools/ci_snippets.py gitlab FOLDER    those of the GitLab job
+python tools/ci_snippets.py gitlab FOLDER    the commands of the GitLab job
 
-The files of the page, the controller and its test, are written into FOLDER, a new one. `.ci/run`
-runs the commands there with the built wheel: that tests the page. Commands of `apt-get` are left
-out: they need root, and `.ci/run` installs the same packages itself.
+The script writes the files of the page, a controller and its test, into the new folder FOLDER.
+`.ci/run` runs the commands there with the built wheel, which tests the page. Commands of `apt-get`
+are left out: they need root, and `.ci/run` installs the same packages itself.
 """
 
 from __future__ import annotations

@@ -1,13 +1,14 @@
-"""Make the pictures of README and the site, the notebook and scenarios/ from today's tool.
+"""Make the pictures of README and the site, the notebook and scenarios/ with the present tool.
 
-    xvfb-run -a python tools/make_pictures.py            each whose text is no longer the tool's
-    xvfb-run -a python tools/make_pictures.py NAME ...   these
-    python tools/make_pictures.py --check                none; name them, and end with 1
+    xvfb-run -a python tools/make_pictures.py            pictures whose text has changed
+    xvfb-run -a python tools/make_pictures.py NAME ...   the named pictures
+    python tools/make_pictures.py --check                print those whose text has changed; end
+                                                         with 1 if there are any
 
-A PNG holds the text that it shows as its "Description": texts tell whether it is today's, and no
-pixels. A drawing is compared as a whole; its template is in `tools/drawings/`. The notebook is
-compared by the texts of its cells. The report needs Chromium (`apt-get install chromium`). Pictures
-of sumo-gui need a display, for which `xvfb-run` stands above.
+A PNG contains the text that it shows as its "Description". The script compares these texts, not
+pixels. It compares a drawing as a whole; its template is in `tools/drawings/`. It compares the
+notebook by the texts of its cells. The report needs Chromium (`apt-get install chromium`). Pictures
+of sumo-gui need a display, which `xvfb-run` provides.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""An oracle of the search: it has all failures, and takes the most useful first."""
+"""An oracle of the search: it is given all failures, and takes the most useful first."""
 
 from __future__ import annotations
 
