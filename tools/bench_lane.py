@@ -5,8 +5,8 @@
 The VUT drives the level-0 profile and merges at a place that the POV does not expect: at the begin
 of the lane, at M, half-way from M to the end, or at the end. The POV is of level 1, with the rule
 of `merge_sumo/drivers/after_merge.py`. Its return up to the merge is compared with the exact best
-response of a driver that is told the place. Regret is a share of the gain of this driver over a driver
-that keeps its speed. For M it is the regret of the point merge.
+response of a driver that is told the place. Regret is a share of the gain of this driver over a
+driver that keeps its speed. For M it is the regret of the point merge.
 
 The script also measures how hard cars brake in the 5 s after merges at M that need at most 1 m/s2
 of the car behind, at level 0: with ACC, as in campaigns, and with IDM.
