@@ -187,8 +187,8 @@ def main() -> None:
     parser.add_argument("--pair", action="append", choices=PAIRS)
     parser.add_argument("--cases", type=int, default=40)
     parser.add_argument("--seeds", type=int, default=5)
-    parser.add_argument("--first", type=int, default=0, help="the first seed")
-    parser.add_argument("--truth", type=int, default=10_000, help="cases of a truth")
+    parser.add_argument("--first", type=int, default=0, help="first seed")
+    parser.add_argument("--truth", type=int, default=10_000, help="cases per truth")
     options = parser.parse_args()
     figures = {}
     for name in options.pair or PAIRS:

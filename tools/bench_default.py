@@ -30,7 +30,7 @@ def main() -> None:
     """Print the figures."""
     parser = benchmark_parser(__doc__)
     parser.add_argument("--runs", type=int, default=5)
-    parser.add_argument("--program", default="merge-sumo", help="another installation's program")
+    parser.add_argument("--program", default="merge-sumo", help="program of another installation")
     options = parser.parse_args()
     took, units = [], []
     with tempfile.TemporaryDirectory() as folder:

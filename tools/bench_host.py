@@ -240,7 +240,7 @@ def main() -> None:
     parser = benchmark_parser(__doc__)
     parser.add_argument("--cases", type=int, default=1280, help="cases per round and K")
     parser.add_argument("--rounds", type=int, default=7)
-    parser.add_argument("--processes", type=int, default=5, help="cases with a process each")
+    parser.add_argument("--processes", type=int, default=5, help="cases with their own process")
     options = parser.parse_args()
     worlds = [(US23, k) for k in KS] + [(named_scenario("us23-traffic"), 32)]
     print(f"{'A':>2} {'K':>4}  us per step, cases per s, ratio to bare, ratio to step")

@@ -406,7 +406,7 @@ def main() -> None:
     """Measure and print the parts that the command line names."""
     parser = benchmark_parser(__doc__)
     parser.add_argument("parts", nargs="*", metavar="PART", default=[*PARTS], help=", ".join(PARTS))
-    parser.add_argument("--most", type=int, default=1_000_000, help="cases of truth and files")
+    parser.add_argument("--most", type=int, default=1_000_000, help="most cases of truth and files")
     options = parser.parse_args()
     unknown = set(options.parts) - PARTS.keys()
     if unknown:

@@ -45,7 +45,7 @@ def build(configuration: Path, output: Path) -> bytes:
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("--out", type=Path, default=SOURCES, help="folder to build them into")
+    parser.add_argument("--out", type=Path, default=SOURCES, help="output folder")
     out = parser.parse_args().out
     for configuration in sorted(SOURCES.glob("*.netccfg")):
         net = out / f"{configuration.stem}.net.xml"

@@ -209,8 +209,8 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("search", choices=SEARCHES)
-    parser.add_argument("--designs", type=int, default=200, help="designs to draw")
-    parser.add_argument("--seed", type=int, default=0, help="of the designs")
+    parser.add_argument("--designs", type=int, default=200, help="number of designs")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the designs")
     options = parser.parse_args()
     SEARCHES[options.search](options)
 

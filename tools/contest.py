@@ -434,14 +434,14 @@ def parsed(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("samplers", nargs="+", metavar="SAMPLER", help="name, or FILE.py:CLASS")
+    parser.add_argument("samplers", nargs="+", metavar="SAMPLER", help="a name, or FILE.py:CLASS")
     parser.add_argument("--problems", help="names, separated by commas; all by default")
     parser.add_argument("--quick", action="store_true", help="two problems, one seed, 50 cases")
-    parser.add_argument("--seeds", type=int, help="searches a problem, seeds 100, 101, ...: 3")
-    parser.add_argument("--cases", type=int, help="cases of a search, 400 at most: 400")
-    parser.add_argument("--limit", type=float, default=LIMIT_S, help="s of a sampler in a search")
-    parser.add_argument("--workers", type=int, help="processes that search; one a core")
-    parser.add_argument("--out", type=Path, default=Path("benchmark"), help="folder to write")
+    parser.add_argument("--seeds", type=int, help="number of seeds, from 100 (default 3)")
+    parser.add_argument("--cases", type=int, help="cases per search, at most 400 (default)")
+    parser.add_argument("--limit", type=float, default=LIMIT_S, help="sampler seconds per search")
+    parser.add_argument("--workers", type=int, help="processes; by default one per core")
+    parser.add_argument("--out", type=Path, default=Path("benchmark"), help="output folder")
     options = parser.parse_args(arguments)
     for spec in options.samplers:
         check_spec(spec)

@@ -282,8 +282,8 @@ def main() -> int:
     """Print the differences; return the exit code."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("run", type=Path, help="folder of a campaign")
-    parser.add_argument("--cases", type=int, default=0, help="recorded and fresh cases in all")
-    parser.add_argument("--seed", type=int, default=0, help="of the fresh cases")
+    parser.add_argument("--cases", type=int, default=0, help="total of recorded and fresh cases")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the fresh cases")
     options = parser.parse_args()
     try:
         peer = f"HighwayEnv {version('highway-env')}"

@@ -369,7 +369,7 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("names", nargs="*", metavar="NAME", help="path in the checkout")
-    parser.add_argument("--check", action="store_true", help="make none")
+    parser.add_argument("--check", action="store_true", help="make no picture")
     options = parser.parse_args()
     if unknown := set(options.names) - set(MAKERS):
         parser.error(f"{min(unknown)} is none of {', '.join(MAKERS)}")

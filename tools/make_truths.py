@@ -99,7 +99,7 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--problems", help="names, separated by commas; all by default")
-    parser.add_argument("--out", type=Path, default=TRUTHS, help="folder to write")
+    parser.add_argument("--out", type=Path, default=TRUTHS, help="output folder")
     options = parser.parse_args()
     chosen = PROBLEMS if options.problems is None else named_problems(options.problems.split(","))
     options.out.mkdir(exist_ok=True)

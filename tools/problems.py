@@ -240,7 +240,7 @@ def check_truth(problem: Problem, plan: SimulationPlan, truth: ProblemTruth) -> 
         probes += len(failed)
     if changed:
         raise UserError(
-            f"the problem {problem.name} is not the one of its truth: {changed} of {probes} probe "
+            f"the truth of the problem {problem.name} is out of date: {changed} of {probes} probe "
             "cases have another verdict; use the version of merge-sumo that made it, or run "
-            "tools/make_truths.py and compare with no earlier number"
+            "tools/make_truths.py and do not compare with earlier numbers"
         )

@@ -82,7 +82,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="Print the table of VUTs that the site has.")
     parser.add_argument("vuts", nargs="*", default=VUTS)
     parser.add_argument("--cases", type=int, default=1000, help="uniform cases at each level")
-    parser.add_argument("--workers", type=int, help="processes; by default one a core")
+    parser.add_argument("--workers", type=int, help="processes; by default one per core")
     arguments = parser.parse_args()
     print(HEAD, flush=True)
     for vut in arguments.vuts:

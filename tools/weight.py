@@ -96,7 +96,7 @@ def frames_under_act() -> int:
 def main() -> None:
     """Print the weights next to the budget."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("--lower", action="store_true", help="write today's weights as the budget")
+    parser.add_argument("--lower", action="store_true", help="write the weights as the budget")
     lower = parser.parse_args().lower
     now = {**weights(), FRAMES: frames_under_act()}
     budget: Weights = json.loads(BUDGET.read_text())
