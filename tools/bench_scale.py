@@ -420,5 +420,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    # Workers find functions by the names of their modules, and do not know this one as __main__.
+    # Workers import functions by the names of their modules, which is not __main__ for them.
     import_module("bench_scale").main()

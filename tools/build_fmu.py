@@ -172,8 +172,8 @@ def build_fmu(
 ) -> Path:
     """Write the FMU; `fault` is C that runs in the fourth step of an episode with v_POV > 30.
 
-    `kind` is the type of state and acceleration, `more` are those of further variables, as
-    `merge="boolean"`: names of `TYPES`.
+    `kind` is the type of state and acceleration. `more` has the types of further variables, as
+    `merge="boolean"`. Types are names of `TYPES`.
     """
     found = compiler()
     if found is None:

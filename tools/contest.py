@@ -106,7 +106,7 @@ class Found:
 
     Attributes:
         search: the search.
-        ran: cases that ran; fewer than those of the search after a fault.
+        ran: number of cases that ran; smaller than `search.cases` after an error.
         failures: [index, level, coordinates in the unit cube...] of each failing case.
         sampler_s: seconds of CPU spent in the sampler.
         fault: the sampler's fault that ended the search; None without.
@@ -394,7 +394,7 @@ def enter(specs: Sequence[str], limit_s: float, workers: Workers) -> list[Entran
 def searches_of(
     problems: Sequence[Problem], entered: Sequence[Entrant], cases: int, seeds: int
 ) -> list[Search]:
-    """Return all searches, those of one problem in a row: a worker keeps its simulator.
+    """Return all searches, ordered by problem, so that a worker keeps its simulator.
 
     Args:
         problems: the problems.
@@ -423,7 +423,7 @@ def parsed(arguments: Sequence[str] | None) -> argparse.Namespace:
     """Parse the command line.
 
     Args:
-        arguments: its arguments; None for those of the process.
+        arguments: its arguments; None for the arguments of the process.
 
     Returns:
         The options.
@@ -467,7 +467,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Run the contest that the command line names; write and print its numbers.
 
     Args:
-        arguments: arguments of the command line; None for those of the process.
+        arguments: arguments of the command line; None for the arguments of the process.
     """
     options = parsed(arguments)
     folder, problems = options.out / SEARCHES, options.problems
@@ -517,7 +517,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    # Workers find functions by the names of their modules, and do not know this one as __main__.
+    # Workers import functions by the names of their modules, which is not __main__ for them.
     try:
         import_module("contest").main()
     except UserError as error:

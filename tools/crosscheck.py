@@ -56,8 +56,8 @@ MOVES_OTHERWISE: Final = "its vehicles move otherwise"
 class HighwayEnvWorld(KinematicSimulation):
     """The state of the vehicles in `corridors` independent corridors, moved by HighwayEnv.
 
-    `x_m` and `v_mps` have shape (A, corridors), as those of a `SumoSimulation`, and are read from
-    its vehicles.
+    `x_m` and `v_mps` have shape (A, corridors), as in a `SumoSimulation`, and are read from its
+    vehicles.
     """
 
     def __init__(self, corridors: int, road: Road, scenario: Scenario) -> None:
@@ -69,7 +69,7 @@ class HighwayEnvWorld(KinematicSimulation):
         limits = {"MAX_SPEED": MAX_SPEED_MPS, "MIN_SPEED": -MAX_SPEED_MPS}
         self._types = [type("Car", (base,), {"LENGTH": one, **limits}) for one in lengths_m]
         self._half_m: FloatArray = np.array(lengths_m)[:, None] / 2.0
-        """From the front bumper back to the centre of a vehicle, which HighwayEnv knows."""
+        """From the front bumper back to the centre, which is the position in HighwayEnv."""
         self._roads = [self._road() for _ in range(corridors)]
 
     def _road(self) -> Any:

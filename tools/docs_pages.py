@@ -149,7 +149,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "formats": formats_table,
     "kinds of failures": kinds_table,
 }
-"""Tables from registries, which stand in a page as `<!-- table: NAME -->`."""
+"""Tables from registries. A page includes one with `<!-- table: NAME -->`."""
 TABLE: Final = re.compile(r"<!-- table: ([\w ]+) -->")
 
 

@@ -95,7 +95,7 @@ def check_spec(spec: str) -> None:
 
 
 def entrants(specs: Sequence[str], limit_s: float) -> list[Entrant]:
-    """Return the samplers of specs, those of other packages after the contract of samplers.
+    """Return the samplers of specs; samplers of other packages first pass the contract.
 
     Args:
         specs: names of the registry, or FILE.py:CLASS.
@@ -211,7 +211,7 @@ class WatchedSampler(Sampler):
         self._sampler = watch.call(make)
 
     def batch_size(self) -> int:
-        """Return its own size of a batch; that of the paper's Table II where it states none."""
+        """Return its own batch size; by default the batch size of the paper's Table II."""
         if type(self._sampler).batch_size is Sampler.batch_size:
             return COMPARED_BATCH
         size = self._watch.call(self._sampler.batch_size)

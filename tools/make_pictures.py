@@ -84,7 +84,7 @@ LINES_SHOWN = 20
 """Lines of a difference that are printed."""
 
 Maker = Callable[[Path | None], str]
-"""Return the text of today's picture; where a new file is given, also write the picture there."""
+"""Return the text of the present picture; with a new file, also write the picture there."""
 
 
 @cache
@@ -175,7 +175,7 @@ def curves_picture(new: Path | None) -> str:
     """Draw the coverage of the samplers against a level-1 POV, as `reproduce` does.
 
     Args:
-        new: new file; None for the text alone, which is that of a smaller study.
+        new: new file; None for the text alone, which is the text of a smaller study.
     """
     column = TABLE_II[1]
     options = config.Benchmark(column.vut, seeds=10, cases=400, truth_cases=10_000)
@@ -322,7 +322,7 @@ def stored_text(path: Path) -> str:
 
 
 def difference(name: str) -> list[str]:
-    """Return the lines in which a stored text differs from today's; none where they are the same.
+    """Return the lines in which a stored text differs from the tool's; none where they are equal.
 
     Args:
         name: path of the picture in the checkout.
@@ -364,7 +364,7 @@ def described_png(path: Path, text: str) -> bytes:
 
 
 def main() -> None:
-    """Make pictures, or name those of an older tool."""
+    """Make pictures, or print the names of outdated pictures."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -380,7 +380,7 @@ def main() -> None:
         elif lines := difference(name):
             stale = True
             if options.check:
-                print(f"{name} is not of today's tool:", *lines[:LINES_SHOWN], sep="\n", flush=True)
+                print(f"{name} is out of date:", *lines[:LINES_SHOWN], sep="\n", flush=True)
             else:
                 make(name)
                 print(f"{name} is made", flush=True)

@@ -121,7 +121,7 @@ class Manifest(Record, frozen=True):
 
 @dataclass(frozen=True, slots=True)
 class ProbeCases:
-    """Cases of a level whose verdicts show whether the code still gives those of the truth.
+    """Cases of a level whose verdicts show whether the truth still fits the code.
 
     Attributes:
         points: in the unit cube, (n, d).

@@ -12,7 +12,7 @@ from merge_sumo.samplers.history import LevelHistory
 from merge_sumo.scenario.case import FloatArray
 
 DESIGN: Final = 12
-"""Cases of a level before the first process is fitted: those of the paper."""
+"""Cases of a level before the first process is fitted, as in the paper."""
 POPULATION: Final = 4000
 NEAREST: Final = 200
 """Points of the population with the least U, among which a batch is chosen."""

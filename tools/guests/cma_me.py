@@ -83,7 +83,7 @@ class Illumination:
     """
 
     def __init__(self, dims: int, seed: Sequence[int], first: int) -> None:
-        """Prepare a search; the size of its first batch is that of the generations."""
+        """Prepare a search; its first batch has the size of a generation."""
         from ribs.archives import GridArchive
         from scipy.stats.qmc import Sobol
 

@@ -19,7 +19,7 @@ DESIGN: Final = 10
 CANDIDATES: Final = 1024
 """Sobol points among which a batch is chosen."""
 KAPPA: Final = 1.96
-"""Weight of the standard deviation: that of the paper."""
+"""Weight of the standard deviation, as in the paper."""
 
 
 class StraddleSampler(LevelwiseSampler):
@@ -28,7 +28,7 @@ class StraddleSampler(LevelwiseSampler):
     Source: Bryan et al., "Active Learning for Identifying Function Threshold Boundaries" (2005):
     kappa sigma - |mu - limit|, which is the ambiguity of GP-UCB level sets (Gotovos et al., 2013)
     with kappa^2 for beta. A batch is chosen one point at a time by `optimize_acqf_discrete`; at its
-    pending points the process believes its own mean. Kernel and priors are those of
+    pending points the process takes its own mean. Kernel and priors come from
     `get_matern_kernel_with_gamma_prior`: the default of `SingleTaskGP`, a squared exponential with
     long length scales, found fewer failures of the VUTs on which this was chosen.
     """
