@@ -127,7 +127,7 @@ class FailureRule:
     """Requirement over time in signal temporal logic, not with --fail-when.
 
     A case fails if it violates the formula, such as 'always ((x_vut_m > -20) implies (bumper_gap_m
-    > 2))'. It needs the extra stl: pip install 'merge-sumo[stl]'.
+    > 2))'. Install the extra stl for it: `pip install 'merge-sumo[stl]'`.
     """
 
 
@@ -143,14 +143,23 @@ class ScenarioChanges:
     sense: AnySensing | None = None
     """Errors of the sensors of the VUT, such as delay_s=0.3,noise_x_m=1.
 
-    The names are delay_s, noise_x_m, noise_v_mps, dropout, range_m and occluded_until_m. A range,
-    such as delay_s=0..0.5, becomes a coordinate of the cases: the sampler chooses a value for each
-    case.
+    - delay_s: age of the states that the VUT gets
+    - noise_x_m, noise_v_mps: standard deviation of the errors of positions and speeds
+    - dropout: share of the steps in which the VUT gets the last state of a car again
+    - range_m: largest distance at which the VUT gets the state of a car
+    - occluded_until_m: position of the VUT from which it gets the states of other cars
+
+    A range, such as delay_s=0..0.5, becomes a coordinate of the cases: the sampler chooses a value
+    for each case.
     """
     act: AnyActuation | None = None
     """Errors of the actuators of the VUT, such as lag_s=0.3,delay_s=0.1.
 
-    The names are lag_s, delay_s and power_w_per_kg. A range is searched as with --sense.
+    - lag_s: time constant of a first-order lag of the acceleration
+    - delay_s: time between a command and its effect
+    - power_w_per_kg: power divided by mass, which limits the acceleration at high speed
+
+    A range becomes a coordinate of the cases, as with --sense.
     """
 
 
@@ -206,9 +215,9 @@ class Execution:
     workers: int | str | None = 1
     """Number of worker processes, auto, or a Dask scheduler, tcp://HOST:PORT. [default: auto]
 
-    auto starts one per core. A campaign of up to 1,000 cases with built-in drivers uses one
-    process. The number does not change the outcomes. On the command line the default is auto, in
-    Python it is 1.
+    With auto each core gets one process. A campaign of up to 1,000 cases with built-in drivers then
+    uses one process in total. The number does not change the outcomes. On the command line the
+    default is auto, in Python it is 1.
     """
     progress: bool | None = None
     """Show progress, or hide it. [default: shown in terminals and notebooks]"""
@@ -250,7 +259,7 @@ class Levels:
     """POV levels: 0, 1, 2 or own, or several with commas.
 
     Level 0 ignores the VUT. Level 1 makes room for a VUT that accelerates. Level 2 expects a VUT
-    that reacts. own is the driver of --pov.
+    that reacts. The level own is the driver of --pov.
     """
 
 
@@ -261,8 +270,9 @@ class EngineChoice:
     engine: str | None = None
     """Engine: kinematic or sumo. [default: kinematic, if the drivers allow]
 
-    kinematic solves the equations of motion without SUMO, and runs at least one case in a hundred
-    in SUMO to compare. It needs a VUT and a POV of this package. sumo runs all cases in SUMO.
+    The engine kinematic solves the equations of motion without SUMO, and repeats at least one case
+    in a hundred in SUMO. It needs a VUT and a POV of this package. The engine sumo runs all cases
+    in SUMO.
     """
 
 
@@ -305,8 +315,8 @@ class CampaignOptions(Execution, Junit, Test, Search, Levels):
     gates: Iterable[str] = ()
     """Exit with 1 for failures, errors, timeouts, regressions, or "fmc>X".
 
-    The option may be given several times. "fmc>X" is met if the FMC at some level is above X.
-    regressions needs --against.
+    The option may be given several times. "fmc>X" is met if the FMC at some level is above X. The
+    gate regressions needs --against.
     """
 
 

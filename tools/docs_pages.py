@@ -9,7 +9,8 @@ from __future__ import annotations
 import inspect
 import re
 import sys
-from collections.abc import Callable
+import textwrap
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, Final
 
@@ -25,32 +26,121 @@ PICTURES = "scenarios/**/*.png"
 NOTEBOOKS = "tutorials/*.ipynb"
 
 
-EXIT_CODES: Final = """# Commands
+COMMANDS: Final = """# Commands
 
-This is `merge-sumo COMMAND --help` of all commands.
+This page lists all commands and all their options. `merge-sumo COMMAND --help` shows a short form
+of it.
+
+"""
+EXIT_CODES: Final = """
+## Exit codes
 
 | exit code | meaning |
 |---|---|
-| 0 | finished |
-| 1 | finished, with the result that the command describes below, such as a case that broke |
-| 2 | wrong usage, or a limit of the system (disk, memory, processes), with one sentence |
-| 70 | a fault of merge-sumo itself, with a traceback: no result |
-| 130, 141, 143 | stopped by Ctrl-C, by a closed pipe, by SIGTERM |
+| 0 | The command finished. |
+| 1 | The command finished, with a result that its section describes, such as a case that broke. |
+| 2 | Wrong usage, or a limit of the system (disk, memory, processes), with one sentence. |
+| 70 | A bug in merge-sumo, with a traceback. There is no result. |
+| 130, 141, 143 | Stopped by Ctrl-C, by a closed pipe, by SIGTERM. |
 
-`merge-sumo --install-completion` teaches your shell to complete commands and options.
+## Shell completion
+
+`merge-sumo --install-completion` lets your shell complete commands and options.
 """
+COMMANDS_NEXT: Final = """
+## Next step
+
+[Python functions](python.md) lists the same commands for scripts and notebooks.
+"""
+CODE: Final = re.compile(r"`[^`]+`|(?<!\w)--[a-z][\w-]*|'[^']*[<(].*?'(?!\w)")
+"""Code, an option or a condition in a text."""
+DEFAULT: Final = re.compile(r"\s+\[default:\s+(.*?)\]", re.DOTALL)
+"""The default of an option in its docstring."""
 
 
 def cli_page() -> str:
-    """Return the help of all commands."""
-    from merge_sumo import cli
+    """Return the page of all commands, with the whole docstring of each option."""
+    from merge_sumo.cli import app
 
-    text = cli.app.generate_docs().replace("# merge-sumo\n", EXIT_CODES, 1)
-    text = re.sub(r"## Table of Contents\n.*?\n(?=\*\*)", "", text, flags=re.DOTALL)
-    # An example is on a line of its own in --help, and in a block on the page.
-    text = re.sub(r"^Example:\s+(.*)$", r"```text\n\1\n```", text, flags=re.MULTILINE)
-    text = re.sub(r"(, --no-[\w-]+)+", "", text)  # it shows opposites that do not exist
-    return re.sub(r"\n {8,}", " ", text)
+    listed: dict[str, str] = {}
+    sections = ""
+    for words, command, panel in commands_of(app):
+        title = f"merge-sumo {words}"
+        about, *paragraphs = inspect.cleandoc(command.help).split("\n\n")
+        line = f"- [`{words}`](#{title.replace(' ', '-')}): {about}\n"
+        listed[panel] = listed.get(panel, "") + line
+        examples = ""
+        sections += f"\n## {title}\n\n{about}\n"
+        for paragraph in paragraphs:
+            if paragraph.startswith("Example:"):
+                examples += paragraph.removeprefix("Example:").strip() + "\n"
+            else:
+                sections += f"\n{as_markdown(paragraph)}\n"
+        with app.app_stack([app, command]):  # whose settings give the names of options
+            sections += f"\n```text\n{examples}```\n{options_of(command)}"
+    commands = "\n".join(f"**{panel}**\n\n{lines}" for panel, lines in listed.items())
+    return f"{COMMANDS}{commands}{EXIT_CODES}{sections}{COMMANDS_NEXT}"
+
+
+def as_markdown(text: str) -> str:
+    """Return a text of help with code in backticks, and with each paragraph in one line.
+
+    Args:
+        text: paragraphs and lists.
+    """
+    text = re.sub(r"(?<!\n)\n(?![\n-])", " ", text)
+    return CODE.sub(lambda code: f"`{code[0].strip('`')}`", text)
+
+
+def commands_of(app: Any, front: str = "", panel: str = "") -> Iterator[tuple[str, Any, str]]:
+    """Yield the words of each command, the command, and the panel of help that lists it.
+
+    Args:
+        app: application of cyclopts.
+        front: words before the name of each command.
+        panel: the panel of all commands; by default each command has its own.
+    """
+    named = [each for each in app.resolved_commands().items() if not each[0].startswith("-")]
+    if not panel:
+        named.sort(key=lambda each: each[1].group[0].sort_key)
+    for name, command in named:
+        shown_in = panel or command.group[0].name
+        if command.default_command is None:
+            yield from commands_of(command, f"{front}{name} ", shown_in)
+        else:
+            yield front + name, command, shown_in
+
+
+def options_of(command: Any) -> str:
+    """Return the options of a command as lists, in the groups and the order of its help.
+
+    Args:
+        command: application of cyclopts.
+    """
+    from cyclopts import App
+    from cyclopts.help import create_parameter_help_panel
+
+    texts = {}
+    # The arguments of merge-sumo have the first paragraph alone.
+    for argument in App.assemble_argument_collection(command, parse_docstring=True):
+        texts[argument.name] = as_markdown(inspect.cleandoc(argument.parameter.help or ""))
+    groups: dict[str, str] = {}
+    arguments = command.assemble_argument_collection(parse_docstring=True)
+    for argument in arguments.filter_by(show=True):
+        (group,) = argument.parameter.group
+        panel = create_parameter_help_panel(group, type(arguments)([argument]), "plaintext")
+        (entry,) = panel.entries
+        text = texts[argument.name]
+        if entry.default:
+            first, *rest = text.split("\n\n")
+            text = "\n\n".join((f"{first} Default: {entry.default}.", *rest))
+        else:
+            text = DEFAULT.sub(r" Default: \1.", text, count=1)
+        names = ", ".join(entry.display_labels_with_metavar)
+        needed = " Required." if entry.required else ""
+        item = textwrap.indent(f"{text}{needed}", "    ").strip()
+        groups[group.name] = groups.get(group.name, "") + f"\n- `{names}`: {item}\n"
+    return "".join(f"\n**{name}**\n{items}" for name, items in groups.items())
 
 
 MEASURES_HEAD: Final = """# Measures
