@@ -48,22 +48,30 @@ def _rows(outcomes: Iterable[Outcome]) -> Rows:
 
 
 class CampaignRun(Result):
-    """A campaign that was run: its folder, read, and its gates; `UserError` for another folder.
+    """A campaign that has run: its cases, its summary and its gates.
+
+    `ms.campaign`, `ms.resume` and `ms.open_run` return it.
 
     Attributes:
-        recorded: the campaign as the rest of the package takes it.
-        folder: the folder of the campaign.
+        recorded: the campaign as other parts of the package use it.
+        folder: the run folder.
+
+    Example:
+        ```python
+        run = ms.campaign("design2", cases=400, seed=1)
+        print(len(run.failures), "failures; see", run.report_file)
+        ```
     """
 
     def __init__(self, folder: Path | str | RecordedCampaign, gates: Iterable[str] = ()) -> None:
-        """Read the folder of a campaign.
+        """Read a run folder.
 
         Args:
-            folder: the folder, or the campaign that was read from it.
-            gates: names of gates, as after `--gate`.
+            folder: the run folder, or a campaign that was read from one.
+            gates: names of gates, as for `--gate`.
 
         Raises:
-            UserError: the folder is not that of a campaign, or a gate is unknown.
+            UserError: the folder is not a run folder, or a gate is unknown.
         """
         self.recorded = (
             folder if isinstance(folder, RecordedCampaign) else RecordedCampaign(Path(folder))
@@ -73,7 +81,7 @@ class CampaignRun(Result):
 
     @property
     def settings(self) -> dict[str, Any]:
-        """Content of `campaign.json`."""
+        """The content of `campaign.json`."""
         return self.recorded.record
 
     @property
@@ -83,67 +91,67 @@ class CampaignRun(Result):
 
     @property
     def cases(self) -> Rows:
-        """All cases, in the order in which they were chosen."""
+        """All cases as rows of `outcomes.jsonl`, in the order of their index."""
         return _rows(self.recorded.outcomes)
 
     @property
     def failures(self) -> Rows:
-        """The failing cases, the worst first."""
+        """The failures as rows of `outcomes.jsonl`, the worst first."""
         return _rows(failures(self.recorded.cases))
 
     @property
     def errors(self) -> Rows:
-        """The cases that ended in an error of the VUT or of the simulation, with the message."""
+        """The cases that ended in an error, as rows of `outcomes.jsonl` with the message."""
         return _rows(o for o in self.recorded.outcomes if o.measures.end.is_error)
 
     @property
     def timeouts(self) -> Rows:
-        """The cases in which the VUT never merged."""
+        """The cases in which the VUT never merged, as rows of `outcomes.jsonl`."""
         return _rows(o for o in self.recorded.outcomes if o.measures.end is End.TIMEOUT)
 
     @cached_property
     def repeats(self) -> list[SecondRun]:
-        """The cases that ran a second time, and whether they went as before."""
+        """The cases that ran a second time, and whether both runs are the same."""
         return read_second_runs(self.recorded)
 
     @cached_property
     def summary(self) -> Summary:
-        """Failures, errors and timeouts, and failure mode coverage by POV level."""
+        """The numbers of failures, errors and timeouts, and the FMC, by POV level."""
         return summarise(self.recorded.outcomes, self.recorded.levels, self.recorded.tolerated)
 
     @cached_property
     def facts(self) -> list[Fact]:
-        """Each fact of the campaign, with the file and the key that it is from."""
+        """The facts of the report, each with its file and its key."""
         return facts_of(self.recorded, self.summary)
 
     @cached_property
     def against(self) -> Comparison | None:
-        """Changes from the version that the campaign is against; None without one."""
+        """The changes since the earlier version of `against`; None without one."""
         return compare_against(self.recorded)
 
     @property
     def regressions(self) -> Rows:
-        """The cases that broke, the worst first: they pass with the earlier version alone."""
+        """The cases that only the earlier version passes, the worst first."""
         cases = [] if self.against is None else self.against.version_changes[0].cases
         broke = [case.later.index for case in cases if case.change is Change.BROKE]
         return _rows(self.recorded.outcome(index) for index in broke)
 
     @cached_property
     def gates(self) -> list[GateResult]:
-        """The gates that were given, and whether the campaign meets them."""
+        """The gates of this object, and whether the campaign meets each."""
         regressions = len(self.regressions)
         return [gate.check(self.summary, regressions) for gate in self._gates]
 
     @property
     def passed(self) -> bool:
-        """Whether the VUT merged in some case, and no gate is met."""
+        """Whether at least one case was judged and no gate is met."""
         return self.summary.tested > 0 and not any(gate.met for gate in self.gates)
 
     is_good = passed
 
     @property
     def converged(self) -> bool:
-        """Whether the search ended before its number of cases, as little new was found."""
+        """Whether the search ended early, because it found little new."""
         return self.recorded.converged
 
     def trajectory(self, index: int) -> Trajectory:
@@ -158,13 +166,15 @@ class CampaignRun(Result):
         return self.recorded.trajectory(index)
 
     def to_dataframe(self) -> DataFrame:
-        """Return the cases as a pandas data frame, with their margins and verdicts.
+        """Return the cases as a pandas data frame, with the columns `margin` and `verdict`.
 
         Raises:
             UserError: pandas is not installed.
 
         Example:
-            >>> run.to_dataframe().groupby("level").verdict.value_counts()
+            ```python
+            run.to_dataframe().groupby("level").verdict.value_counts()
+            ```
         """
         frame = require("pandas", "notebook").json_normalize(self.cases)
         frame["margin"] = [outcome.margin for outcome in self.outcomes]
@@ -172,11 +182,14 @@ class CampaignRun(Result):
         return frame
 
     def plot_map(self, level: int, axes: Axes | None = None) -> Axes:
-        """Draw the starts of the cases of a POV level, and return the axes.
+        """Draw the map of a POV level: the start of each case.
 
         Args:
-            level: level of the POV.
+            level: POV level.
             axes: axes of matplotlib to draw into; None for a new figure.
+
+        Returns:
+            The axes.
 
         Raises:
             UserError: the campaign has no such level, or matplotlib is not installed.
@@ -187,7 +200,7 @@ class CampaignRun(Result):
         return draw_map(at_level, self.recorded.scenario.dimensions(level), axes)
 
     def plot_case(self, index: int, axes: Axes | None = None) -> Axes:
-        """Draw the positions of all cars of a case over time, with its timeline.
+        """Draw the position of each car of a case over time, with the timeline.
 
         Args:
             index: index of the case.
@@ -212,11 +225,11 @@ class CampaignRun(Result):
 
     @property
     def report_file(self) -> Path:
-        """Where the HTML report is."""
+        """The path of the HTML report."""
         return self.folder / "report.html"
 
     def report(self) -> Path:
-        """Write the HTML report and return its path."""
+        """Write the HTML report, and return its path."""
         from merge_sumo.reports.report import write_report
 
         return write_report(self.recorded)
@@ -224,9 +237,12 @@ class CampaignRun(Result):
     def to_record(self) -> dict[str, Any]:
         """Return the object that `merge-sumo campaign --json` prints.
 
-        `contacts` counts failures in which bodies overlap; `shares` has the uniform starts of each
-        level, of which `failures` fail and `without_verdict` are not judged; `worst_case` is the
-        index of the failure with the lowest margin.
+        Its keys include:
+
+        - `contacts`: number of failures in which bodies overlap.
+        - `shares`: the uniform starts of each level, with the number of `failures` and of starts
+          that are not judged (`without_verdict`).
+        - `worst_case`: index of the failure with the lowest margin.
         """
         shares, worst = SHARES.read(self.folder), failures(self.recorded.cases)
         record = {
@@ -247,7 +263,7 @@ class CampaignRun(Result):
         return record
 
     def lines(self) -> list[str]:
-        """Return the table of POV levels, remarks, and the path of the report."""
+        """Return the table of POV levels, the remarks, and the path of the report."""
         run, warning = self.recorded, unrepeatable(self.repeats)
         return [
             *([] if warning is None else [warning]),
@@ -264,7 +280,7 @@ class CampaignRun(Result):
         return [*comparison_summary(self.against), *page, ""]
 
     def remarks(self) -> list[str]:
-        """Return sentences on the gates, and one where no case could be judged."""
+        """Return a sentence for each gate, and one if no case could be judged."""
         untested = [] if self.summary.tested else [self.summary.nothing_tested]
         return [*(gate.sentence for gate in self.gates), *untested]
 
@@ -273,31 +289,42 @@ class CampaignRun(Result):
 
 
 class CaseRun(Result):
-    """One case that was run; its table begins `from_s` before its first conflict."""
+    """One case that has run. `ms.run` returns it.
+
+    Attributes:
+        outcome: the result of the case.
+        trajectory: the motion of all vehicles.
+
+    Example:
+        ```python
+        case = ms.run("design1", level=0, x_pov0_m=-285, v_pov0_mps=33)
+        print(case.failed, case.measures.severity, case.timeline.result)
+        ```
+    """
 
     def __init__(self, episode: Episode, from_s: float | None = None) -> None:
-        """Take an episode that has ended.
+        """Take a simulated case.
 
         Args:
-            episode: the episode.
-            from_s: where its table begins, before the first conflict, in s; None for the start.
+            episode: the simulated case.
+            from_s: begin of the printed motion, in s before the first conflict; None for the start.
         """
         self.outcome, self.trajectory = episode.outcome, episode.trajectory
         self._from_s = from_s
 
     @property
     def measures(self) -> Measures:
-        """Verdict and measures."""
+        """The measures of the case."""
         return self.outcome.measures
 
     @property
     def failed(self) -> bool:
-        """Whether this case is a failure of the VUT under the criterion."""
+        """Whether the case fails by the failure criterion."""
         return self.outcome.failed
 
     @property
     def passed(self) -> bool:
-        """Whether the VUT merged, and the case is not a failure."""
+        """Whether the VUT merged and the case does not fail."""
         return self.measures.end is End.MERGED and not self.failed
 
     is_good = passed
@@ -313,13 +340,13 @@ class CaseRun(Result):
         return f"<case: {self.timeline.result}>"
 
     def to_record(self) -> dict[str, Any]:
-        """Return the object that `merge-sumo run --json` prints: outcome, motion, and signals."""
+        """Return the object that `merge-sumo run --json` prints: outcome, motion and signals."""
         record = {**self.outcome.to_record(), "motion": self.trajectory.whole.tolist()}
         left = {"signals": self.trajectory.signals, "in_vain": self.trajectory.in_vain}
         return record | {name: value for name, value in left.items() if value}
 
     def lines(self) -> list[str]:
-        """Return verdict, measures and motion, as `merge-sumo run` prints them."""
+        """Return result, measures and motion, as `merge-sumo run` prints them."""
         notes = [f"note: {note}" for note in in_vain(dict.fromkeys(self.trajectory.in_vain, 1))]
         return [*episode_lines(self.outcome, self.trajectory, self._from_s), *notes]
 

@@ -13,18 +13,21 @@ MOST_CHARACTERS = 10_000
 
 
 class UserError(Exception):
-    """Bad input or a missing part of the installation; the command line prints it and exits 2."""
+    """Wrong input, or a missing part of the installation, in one sentence with a remedy.
+
+    The command line prints the sentence and exits with code 2.
+    """
 
     def __init__(self, sentence: str) -> None:
-        """Join the lines of a sentence.
+        """Take the sentence, in one line.
 
         Args:
-            sentence: what is wrong and what to do; it may quote several lines of a library.
+            sentence: the problem and the remedy. It may quote several lines of a library.
         """
         super().__init__(" ".join(sentence[:MOST_CHARACTERS].splitlines()))
 
     def _render_traceback_(self) -> list[str]:
-        """Return the lines that a notebook shows: the sentence without a traceback."""
+        """Return the lines that a notebook shows: the sentence, without a traceback."""
         return [f"{type(self).__name__}: {self}", *getattr(self, "__notes__", ())]
 
 
@@ -50,7 +53,7 @@ class WorkersLostError(UserError):
 
 
 class Notice(UserWarning):
-    """A warning about a result; the command line prints it as a sentence."""
+    """A warning about a result. The command line prints it as a note."""
 
 
 def notice(sentence: str, category: type[Warning] = Notice) -> None:

@@ -22,7 +22,7 @@ def lines_of(result: Result) -> list[str]:
 
 
 class Result:
-    """A result: `print` and a notebook show its lines, `repr` the first of them.
+    """A result: `print` and a notebook show its lines, `repr` shows the first line.
 
     Control characters are escaped.
     """
@@ -33,7 +33,7 @@ class Result:
 
     @property
     def is_good(self) -> bool:
-        """Whether the command ends with 0, and not with 1."""
+        """Whether the exit code of the command is 0, and not 1."""
         return True
 
     def to_record(self) -> dict[str, Any]:
@@ -58,15 +58,20 @@ class Result:
 
 @dataclass(frozen=True, slots=True, repr=False)
 class Shown(Result):
-    """A result that is only shown: what `--json` prints, and the lines."""
+    """A result without attributes of its own: the object that `--json` prints, and lines of text.
+
+    Attributes:
+        record: the object that `--json` prints.
+        text: the lines.
+    """
 
     record: dict[str, Any]
     text: list[str]
 
     def to_record(self) -> dict[str, Any]:
-        """Return the record."""
+        """Return the object that `--json` prints."""
         return self.record
 
     def lines(self) -> list[str]:
-        """Return the lines."""
+        """Return the lines of text."""
         return self.text

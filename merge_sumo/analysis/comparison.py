@@ -132,14 +132,13 @@ class ComparedCase:
     """A case that two versions ran.
 
     Attributes:
-        earlier: its outcome with the earlier version.
-        later: its outcome with the later version.
+        earlier: outcome with the earlier version; of several runs, the deciding run.
+        later: outcome with the later version; of several runs, the deciding run.
         change: the change from `earlier` to `later`.
-        earlier_runs: its runs with the earlier version, of which `earlier` decides; None for a
-            single run.
-        later_runs: its runs with the later version.
-        p_value: p-value of Fisher's exact test of the shares of failing runs; None where the runs
-            with each version are alike.
+        earlier_runs: all runs with the earlier version; None for a single run.
+        later_runs: all runs with the later version; None for a single run.
+        p_value: p-value of Fisher's exact test of the shares of failing runs; None if the runs of
+            each version do not differ.
     """
 
     earlier: Outcome
@@ -171,7 +170,7 @@ class ComparedCase:
         return cls(a, b, _change(a, b, p_value), runs, other, p_value)
 
     def to_record(self) -> dict[str, Any]:
-        """Return the case as JSON has it."""
+        """Return the object that `--json` prints."""
         record: dict[str, Any] = {"change": self.change, "level": self.earlier.case.level}
         sides = (
             ("before", self.earlier, self.earlier_runs),
@@ -239,14 +238,14 @@ def in_order(cases: Iterable[ComparedCase]) -> list[ComparedCase]:
 
 @dataclass(frozen=True, slots=True)
 class VersionChange:
-    """The changes from a version to the next.
+    """The changes from one version to the next.
 
     Attributes:
         number: number of the later version, from 2.
-        cases: the cases that both ran, in the order of `in_order`.
-        p_value: p-value of Fisher's exact test of the shares of cases that pass; None where the
-            versions ran the same cases, and where different samplers chose them.
-        passes_less: whether the later version passes in a smaller share, by more than chance.
+        cases: the cases that both versions ran, by change and by margin.
+        p_value: p-value of Fisher's exact test of the shares of cases that pass; None if the
+            versions ran the same cases, or if different samplers chose them.
+        passes_less: whether the later version passes a significantly smaller share of its cases.
     """
 
     number: int
@@ -256,7 +255,7 @@ class VersionChange:
 
     @property
     def transitions(self) -> dict[tuple[Change, str, str], int]:
-        """Number of cases by change, and by the earlier and the later outcome in words."""
+        """Number of cases by change, earlier outcome and later outcome, in words."""
         found: Counter[tuple[Change, str, str]] = Counter()
         for one in self.cases:
             found[one.change, outcome_word(one.earlier), outcome_word(one.later)] += 1
@@ -264,7 +263,7 @@ class VersionChange:
 
     @property
     def groups(self) -> Counter[str]:
-        """Number of cases of each group; worse and better also where there are none."""
+        """Number of cases of each group, such as worse and better."""
         found = Counter({"worse": 0, "better": 0})
         found.update(one.change.group for one in self.cases)
         return found
@@ -278,7 +277,7 @@ class VersionChange:
         return sum(case.change is change for case in self.cases)
 
     def to_record(self) -> dict[str, Any]:
-        """Return the changes as JSON has them, without the cases that pass with both versions."""
+        """Return the object that `--json` prints, without the cases that pass with both."""
         transitions = []
         for (change, before, after), number in self.transitions.items():
             row = {"change": change, "before": before, "after": after, "cases": number}
@@ -295,18 +294,22 @@ class VersionChange:
 
 @dataclass(frozen=True, slots=True, repr=False)
 class Comparison(Result):
-    """Versions of a VUT, the oldest first, and the changes from each to the next.
+    """The comparison of two or more versions of a controller.
+
+    `ms.compare` and `ms.rerun` return it.
 
     Example:
+        ```python
         compared = ms.compare(["runs/before", "runs/after"])
         assert not compared.worse, compared
+        ```
 
     Attributes:
-        versions: the versions.
-        version_changes: the changes, one for each version but the first.
-        source: a sentence on the origin of the cases.
-        notes: sentences on the limits of the comparison.
-        text: the new text of a cases file, whose changed lines are in the notes; None otherwise.
+        versions: the versions, the oldest first.
+        version_changes: the changes from each version to the next.
+        source: where the cases come from, in a sentence.
+        notes: limits of the comparison, in sentences.
+        text: new text of a cases file, after the rerun of one; its changed lines are in the notes.
     """
 
     versions: tuple[Version, ...]
@@ -322,19 +325,19 @@ class Comparison(Result):
 
     @property
     def is_good(self) -> bool:
-        """See `Result`."""
+        """Whether nothing got worse: the exit code of the command is then 0."""
         return not self.worse
 
     @property
     def worse(self) -> bool:
-        """Whether a case got worse, a version passes less often, or the last one tested no case."""
+        """Whether a case got worse, a version passes less often, or no case is judged at last."""
         for one in self.version_changes:
             if one.passes_less or one.groups["worse"]:
                 return True
         return not any(outcome.is_tested for outcome in self.versions[-1].outcomes)
 
     def to_record(self) -> dict[str, Any]:
-        """Return what `--json` prints."""
+        """Return the object that `--json` prints."""
         return {
             "worse": self.worse,
             "broke": self.broke,

@@ -124,6 +124,15 @@ EXPLANATIONS = StudyFile("explanations.jsonl", Explanation)
 class ExplanationResult(Result):
     """The smallest changes with which a failure of a campaign passes.
 
+    `ms.explain` returns it.
+
+    Example:
+        ```python
+        explained = ms.explain("runs/latest", 19)
+        for axis in explained.found.start:
+            print(axis.name, axis.value, "passes at", axis.passing)
+        ```
+
     Attributes:
         run: the campaign.
         found: the changes.
@@ -133,7 +142,7 @@ class ExplanationResult(Result):
     found: Explanation
 
     def to_record(self) -> dict[str, Any]:
-        """Return what `--json` prints."""
+        """Return the object that `--json` prints."""
         return {**to_plain(self.found), "file": str(self.run.folder / EXPLANATIONS.name)}
 
 

@@ -65,17 +65,18 @@ NAMED = 20
 
 
 class Stratum(Record, frozen=True):
-    """The results of the cases that were drawn from a stratum.
+    """The cases that were drawn from a stratum, a part of the pool.
 
     Attributes:
-        expects_failures: whether the campaign expects failures in it.
-        share: probability of a case in it.
-        cases: number of fresh cases.
-        failures: number of those that fail.
-        without_verdict: number of those without a verdict: errors, and timeouts that are not
+        expects_failures: whether the campaign expects failures in the stratum.
+        share: probability of a case in the stratum, from 0 to 1.
+        cases: number of new cases.
+        failures: number of new cases that fail.
+        without_verdict: number of new cases that are not judged: errors, and timeouts that are not
             failures.
-        low: lower end of the interval of the share that fails; cases without a verdict are safe.
-        high: upper end; cases without a verdict are failures.
+        low: lower end of the interval of the share that fails; cases that are not judged count as
+            safe.
+        high: upper end; cases that are not judged count as failures.
     """
 
     expects_failures: bool
@@ -88,13 +89,14 @@ class Stratum(Record, frozen=True):
 
 
 class Estimate(Record, frozen=True):
-    """A failure probability with its interval.
+    """A failure probability with its confidence interval.
 
     Attributes:
-        probability: the estimate; cases without a verdict count as safe.
-        low: lower end of its interval, which holds with the confidence of the result.
-        high: upper end.
-        strata: the stratum without expected failures, then that with them; one may be missing.
+        probability: the estimate, from 0 to 1; cases that are not judged count as safe.
+        low: lower end of the interval.
+        high: upper end of the interval.
+        strata: the part of the pool without expected failures, then the part with expected
+            failures. One of them may be missing.
     """
 
     probability: float
@@ -126,23 +128,28 @@ class PerMerge(Record, frozen=True):
 
 
 class ProbabilityResult(Result, Record, frozen=True):
-    """The failure probability of a VUT.
+    """The failure probability of a controller, with its confidence interval.
+
+    `ms.probability` returns it.
 
     Example:
+        ```python
         found = ms.probability("runs/latest", cases=4000)
         assert found.overall.high < 0.01
+        ```
 
     Attributes:
-        overall: over the weighed levels; None with a traffic, which has no weights of levels.
-        levels: the estimate of each level.
-        per_merge: failures per merge; None without a traffic.
-        confidence: probability with which an interval holds.
-        cases: number of fresh cases.
-        in_sumo: number of those that ran in SUMO.
-        missed: level and coordinates of unexpected failures, at most `NAMED`.
-        distribution: the distribution of the cases, as in a file.
-        seed: seed of the draws.
-        engine: the engine that moved the vehicles.
+        overall: estimate over all levels, by their weights; None with traffic, which has no
+            weights of levels.
+        levels: estimate of each POV level.
+        per_merge: failures per merge; None without traffic.
+        confidence: confidence of each interval, 0.95 for 95 %.
+        cases: number of new cases.
+        in_sumo: number of new cases that ran in SUMO.
+        missed: level and coordinates of at most 20 failures that the campaign did not expect.
+        distribution: distribution of the cases, as in a distribution file.
+        seed: seed of the new cases.
+        engine: engine that moved the vehicles.
         campaign: settings, versions and hashes, as in `campaign.json`.
     """
 
@@ -160,7 +167,7 @@ class ProbabilityResult(Result, Record, frozen=True):
 
     @property
     def without_verdict(self) -> int:
-        """Number of cases without a verdict."""
+        """Number of cases that are not judged."""
         number = 0
         for level in self.levels.values():
             number += sum(one.without_verdict for one in level.strata)
@@ -168,7 +175,7 @@ class ProbabilityResult(Result, Record, frozen=True):
 
     @property
     def is_judged(self) -> bool:
-        """Whether any case has a verdict: otherwise the probability is not known."""
+        """Whether any case is judged; otherwise the probability is unknown."""
         return self.without_verdict < self.cases
 
 

@@ -190,19 +190,23 @@ class ColumnResult:
 
 @dataclass(frozen=True, repr=False)
 class Reproduction(Result):
-    """The results of the paper, and ours.
+    """The results of the paper next to the results of merge-sumo.
+
+    `ms.reproduce` returns it.
 
     Example:
+        ```python
         found = ms.reproduce(quick=True, out="reproduction")
         print(found)
+        ```
 
     Attributes:
-        scale: the numbers of cases and seeds.
-        columns: the columns of Table II, by title.
-        levels: the batches of searches at all levels together, by sampler.
-        policies_sha256: hashes of the POV networks, by name.
+        scale: numbers of cases and seeds.
+        columns: columns of Table II of the paper, by title.
+        levels: batches of searches at all levels together, by sampler.
+        policies_sha256: hashes of the networks of the POV, by name.
         versions: versions of the software, by name.
-        page: the page with the results; None where it was not written.
+        page: page with the results; None if it was not written.
     """
 
     scale: Scale
@@ -213,7 +217,7 @@ class Reproduction(Result):
     page: Path | None = None
 
     def to_record(self) -> dict[str, Any]:
-        """Return Table II for a program."""
+        """Return the object that `--json` prints: Table II."""
         columns = []
         for one in self.columns.values():
             columns.append({**to_plain(one.column), **one.study.to_record()})

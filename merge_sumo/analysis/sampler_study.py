@@ -281,19 +281,19 @@ class Spread:
 
 @dataclass(frozen=True, slots=True)
 class SamplerSummary:
-    """One sampler over all seeds; FMC is summed over the levels.
+    """The results of one sampler over all seeds; FMC is summed over the levels.
 
     Attributes:
         fmc: failure mode coverage.
-        fmc_over_truth: as a share of the truth's; None where that is too small.
-        fmc_over_limit: as a share of `SamplerStudy.limit_fmc`.
-        covered_share: share of the truth's failures within a radius of a failure found, the mean
-            over the levels with any.
-        failures: failures found.
-        regions_found: regions of the truth in which a failure was found; None where the truth
-            is too small to tell regions.
-        cases_to_90_percent: cases until .9 of the truth's FMC.
-        cases_by_batch: cases after each batch.
+        fmc_over_truth: FMC divided by the FMC of the truth; None if the truth is too small.
+        fmc_over_limit: FMC divided by `SamplerStudy.limit_fmc`.
+        covered_share: share of the failures of the truth that lie within a radius of a failure of
+            the search; the mean over the levels with failures.
+        failures: number of failures found.
+        regions_found: number of regions of the truth in which the search found a failure; None if
+            the truth is too small for regions.
+        cases_to_90_percent: number of cases until 90 % of the FMC of the truth.
+        cases_by_batch: number of cases after each batch.
         fmc_by_batch: quartiles of FMC after each batch, at 25, 50 and 75 %.
     """
 
@@ -310,17 +310,21 @@ class SamplerSummary:
 
 @dataclass(frozen=True, repr=False)
 class SamplerStudy(Result):
-    """Samplers in comparison with each other and with the ground truth, over several seeds.
+    """The comparison of samplers with each other and with the ground truth.
+
+    `ms.benchmark` returns it.
 
     Example:
+        ```python
         study = ms.benchmark("design1", level=0, seeds=3)
         print(study.samplers["coverage"].fmc.median)
+        ```
 
     Attributes:
-        searches: the searches of each sampler, one a seed.
-        truths: the truth by level.
-        dense: the dense truth of the levels that have one.
-        figure: file of the figure, if any.
+        searches: the searches of each sampler, one for each seed.
+        truths: the truth of each POV level.
+        dense: the dense truth (1,000,000 cases) of the levels that have one.
+        figure: file of the figure, if there is one.
     """
 
     searches: dict[str, list[SamplerRun]]
@@ -330,17 +334,17 @@ class SamplerStudy(Result):
 
     @cached_property
     def truth_fmc(self) -> float:
-        """Failure mode coverage of the truth, summed over the levels."""
+        """FMC (failure mode coverage) of the truth, summed over the levels."""
         return sum(fmc(truth.failures) for truth in self.truths.values())
 
     @property
     def is_small(self) -> bool:
-        """Whether a truth is too small for shares and regions."""
+        """Whether a truth is too small to give shares and regions."""
         return any(truth.is_small for truth in self.truths.values())
 
     @cached_property
     def regions(self) -> list[tuple[int, FloatArray]] | None:
-        """Level and points, (m, d), of each region of the truths; None where one is too small."""
+        """Level and points (m, d) of each region of the truths; None if a truth is too small."""
         if self.is_small:
             return None
         found = []
@@ -350,11 +354,11 @@ class SamplerStudy(Result):
 
     @cached_property
     def limit_fmc(self) -> float:
-        """FMC of all known failures, summed over the levels: no search has more.
+        """FMC of all known failures, summed over the levels: the upper limit of a search.
 
-        A truth of a few thousand cases misses failures that searches find. At each level this is
-        the FMC of the failures of truth and searches together, or of a dense truth, if that is
-        more.
+        A truth of a few thousand cases misses failures that searches find. At each level the limit
+        is the FMC of the failures of truth and searches together, or of a dense truth if that is
+        larger.
         """
         total = 0.0
         for level, truth in self.truths.items():
@@ -365,9 +369,9 @@ class SamplerStudy(Result):
 
     @cached_property
     def probes(self) -> dict[int, FloatArray]:
-        """The failures of which `covered_share` is a share, by level, as points (m, d).
+        """The failures that `covered_share` counts, by level, as points (m, d).
 
-        They are those of the dense truth, if any: the more, the smaller the error.
+        They come from the dense truth if there is one: more failures give a smaller error.
         """
         points = {}
         for level, truth in self.truths.items():
@@ -378,7 +382,7 @@ class SamplerStudy(Result):
 
     @cached_property
     def samplers(self) -> dict[str, SamplerSummary]:
-        """The summary of each sampler."""
+        """The summary of each sampler, by its name."""
         return {name: self._summary(searches) for name, searches in self.searches.items()}
 
     def _summary(self, searches: Sequence[SamplerRun]) -> SamplerSummary:
@@ -415,7 +419,7 @@ class SamplerStudy(Result):
         )
 
     def to_record(self) -> dict[str, Any]:
-        """Return what `--json` prints."""
+        """Return the object that `--json` prints."""
         return {
             "truth_fmc": self.truth_fmc,
             "truth_failures": sum(len(truth.failures) for truth in self.truths.values()),

@@ -69,17 +69,21 @@ class Rung(Record, frozen=True):
 
 
 class StressResult(Result, Record, frozen=True):
-    """The results of a stress test of a campaign.
+    """How small changes of the simulation change the results of a campaign.
+
+    `ms.stress` returns it.
 
     Example:
+        ```python
         found = ms.stress("runs/latest")
-        print(found.robust)
+        print(len(found.robust), "of", len(found.failures), "failures are robust")
+        ```
 
     Attributes:
-        cases: number of recorded cases with a verdict, which ran again.
-        failures: indices of those that failed in the record, the worst first.
-        rungs: the results on each rung.
-        vut: name of the VUT.
+        cases: number of judged cases of the campaign, which ran again.
+        failures: indices of the recorded failures, the worst first.
+        rungs: the results of each change.
+        vut: spec of the controller.
     """
 
     computed = ("robust",)
@@ -91,12 +95,12 @@ class StressResult(Result, Record, frozen=True):
 
     @property
     def runs(self) -> int:
-        """Number of times that every case ran."""
+        """Number of runs of each case."""
         return sum(len(rung.runs) for rung in self.rungs)
 
     @property
     def robust(self) -> tuple[int, ...]:
-        """Indices of the failures that fail in every run of every rung, the worst first."""
+        """Indices of the failures that fail in every run of every change, the worst first."""
         fragile: set[int] = set()
         for rung in self.rungs:
             for run in rung.runs:
@@ -104,10 +108,10 @@ class StressResult(Result, Record, frozen=True):
         return tuple(index for index in self.failures if index not in fragile)
 
     def share(self, rung: Rung) -> float:
-        """Return the share of verdicts that flip on a rung.
+        """Return the share of results that flip with a change, from 0 to 1.
 
         Args:
-            rung: the rung.
+            rung: the results of the change.
         """
         return sum(rung.counts) / max(self.cases * len(rung.runs), 1)
 

@@ -50,15 +50,17 @@ others .03 to .83."""
 
 @dataclass(frozen=True, slots=True)
 class Truth:
-    """The ground truth of a VUT at a level: n uniform cases of d coordinates, and their margins.
+    """The ground truth at one POV level: n uniform cases of d coordinates, and their margins.
 
     Example:
-        truth = ground_truth(plan, level=0, cases=1000)
+        ```python
+        truth = ms.truth("design1", level=0).truths[0]
         share = len(truth.failures) / len(truth.margin)
+        ```
 
     Attributes:
         points: cases in the unit cube, (n, d).
-        margin: below 0 for a failure, NaN without a verdict, (n,).
+        margin: margin of each case, (n,); below 0 it fails, NaN if it is not judged.
         in_sumo: number of cases that ran in SUMO.
     """
 
@@ -68,21 +70,21 @@ class Truth:
 
     @property
     def failures(self) -> FloatArray:
-        """Points of the failing cases, (m, d)."""
+        """The points of the failing cases, (m, d)."""
         return self.points[self.margin < 0.0]
 
     @property
     def growth(self) -> float:
-        """The largest share that n further cases could add to its FMC."""
+        """The largest share that n more cases could add to the FMC."""
         return growth_bound(self.failures)
 
     @property
     def is_small(self) -> bool:
-        """Whether n further cases could add so much to its FMC that it has no shares or regions."""
+        """Whether n more cases could add too much to the FMC to give shares and regions."""
         return self.growth > MOST_GROWTH
 
     def to_record(self) -> dict[str, Any]:
-        """Return the truth as JSON has it."""
+        """Return the object that `--json` prints."""
         failures = self.failures
         return {
             "cases": len(self.margin),
@@ -96,7 +98,7 @@ class Truth:
         }
 
     def real_regions(self) -> list[FloatArray]:
-        """Return the points, (m, d), of each region with at least `REAL_REGION` of the failures."""
+        """Return the points (m, d) of each region with at least `REAL_REGION` of the failures."""
         points = self.failures
         labels = regions(points)
         real = np.flatnonzero(np.bincount(labels) >= REAL_REGION * len(points))
@@ -221,17 +223,21 @@ def _margin_of(episode: Episode) -> tuple[float, bool, Files]:
 
 @dataclass(frozen=True, repr=False)
 class TruthResult(Result):
-    """The ground truth of a VUT at one or more POV levels.
+    """The ground truth of a controller: thousands of uniform cases at each POV level.
+
+    `ms.truth` returns it.
 
     Example:
+        ```python
         truth = ms.truth("design1", level=0).truths[0]
         failing = truth.points[truth.margin < 0.0]
+        ```
 
     Attributes:
-        vut: spec of the VUT.
-        truths: the truth by level.
-        criterion: the criterion of a failure.
-        scenario: the scenario of the cases.
+        vut: spec of the controller.
+        truths: the truth of each level.
+        criterion: failure criterion.
+        scenario: scenario of the cases.
     """
 
     vut: str
@@ -240,6 +246,6 @@ class TruthResult(Result):
     scenario: Scenario
 
     def to_record(self) -> dict[str, Any]:
-        """Return what `--json` prints."""
+        """Return the object that `--json` prints."""
         levels = [{"level": level, **truth.to_record()} for level, truth in self.truths.items()]
         return {"vut": self.vut, "fail_when": self.criterion.as_written, "levels": levels}

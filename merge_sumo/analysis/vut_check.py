@@ -35,18 +35,20 @@ CORRIDORS = 4
 
 @dataclass(frozen=True, kw_only=True, slots=True, repr=False)
 class VutCheck(Result):
-    """The faults of a VUT, and the cost of a step.
+    """The problems of a controller, and the time of a step. `ms.check_vut` returns it.
 
     Example:
+        ```python
         found = ms.check_vut("my_vut.py:MyVut")
         assert found.ok, found.problems
+        ```
 
     Attributes:
-        vut: spec of the VUT.
-        problems: sentences on faults that make results wrong or worthless.
-        notes: other sentences for the author of the VUT.
-        us_per_step_median: time of one step of one episode without SUMO, in microseconds; None for
-            a VUT that does not start.
+        vut: spec of the controller.
+        problems: problems that make results wrong or useless, each in a sentence.
+        notes: other sentences for the author of the controller.
+        us_per_step_median: median time of a step of one episode without SUMO, in microseconds; None
+            for a controller that does not start.
     """
 
     computed = ("ok",)
@@ -58,12 +60,12 @@ class VutCheck(Result):
 
     @property
     def is_good(self) -> bool:
-        """Whether the command ends with exit code 0: the same as `ok`."""
+        """Whether the exit code of the command is 0: the same as `ok`."""
         return self.ok
 
     @property
     def ok(self) -> bool:
-        """Whether nothing is wrong."""
+        """Whether there are no problems."""
         return not self.problems
 
 

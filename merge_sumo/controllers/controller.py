@@ -19,11 +19,11 @@ from merge_sumo.scenario.signals import StepSignals
 
 
 class Car(NamedTuple):
-    """A car of the mainline.
+    """A car on the mainline.
 
     Attributes:
-        x_m: distance of its front bumper to M along its lane, negative before M.
-        v_mps: its speed.
+        x_m: position of its front bumper along the lane, in m; 0 at M, negative before M.
+        v_mps: speed, in m/s.
     """
 
     x_m: float
@@ -39,16 +39,17 @@ class _State(NamedTuple):
 
 
 class Seen(_State):
-    """Observation of a VUT at a step: the state of the road, and nothing of the POV's driver.
+    """The observation of a controller at a step: the state of the road.
 
-    A controller that drives a POV (`--pov`) sees itself as the VUT, and the VUT as the POV.
+    It does not contain the level and the psi of the POV. A controller that drives a POV (`--pov`)
+    sees its own vehicle as the VUT, and the VUT as the POV.
 
-    In traffic the conflicting car counts as POV: the one that would be nearest to M when the VUT is
-    there, if the car kept its speed and the VUT drove the scenario's level-0 profile
-    (`drivers.car_following.conflicting_car`). `others` has all cars.
+    In traffic the conflicting car counts as the POV. merge-sumo assumes that each car keeps its
+    speed, and that the VUT drives the level-0 profile of the scenario. The conflicting car is then
+    the car nearest to M when the VUT reaches M. `others` has all cars.
 
-    On a road with an acceleration lane the lane begins at `lane_begin_m` and ends at `lane_end_m`;
-    M is where a merge is expected. Elsewhere both are 0, and the VUT merges at M.
+    On a road with an acceleration lane, the lane begins at `lane_begin_m` and ends at `lane_end_m`,
+    and M is where a merge is expected. Without a lane both are 0, and the VUT merges at M.
 
     Example:
         ```python
@@ -57,11 +58,11 @@ class Seen(_State):
         ```
 
     Attributes:
-        t_s: time since the episode began.
-        x_pov_m: distance of the POV's front bumper to M along its lane, negative before M.
-        v_pov_mps: speed of the POV.
-        x_vut_m: distance of the VUT's front bumper to M along its lane, negative before M.
-        v_vut_mps: speed of the VUT.
+        t_s: time since the begin of the episode, in s.
+        x_pov_m: position of the POV's front bumper, in m; 0 at M, negative before M.
+        v_pov_mps: speed of the POV, in m/s.
+        x_vut_m: position of the VUT's front bumper, in m; 0 at M, negative before M.
+        v_vut_mps: speed of the VUT, in m/s.
     """
 
     _traffic: tuple[Car, ...] = ()
@@ -70,7 +71,7 @@ class Seen(_State):
 
     @property
     def others(self) -> tuple[Car, ...]:
-        """All cars of the mainline, the one in front first."""
+        """All cars on the mainline, the first one ahead."""
         if not self._traffic:
             return (Car(self.x_pov_m, self.v_pov_mps),)
         cars = list(self._traffic)
@@ -79,22 +80,22 @@ class Seen(_State):
 
     @property
     def lane_begin_m(self) -> float:
-        """Where the acceleration lane begins; 0 without one."""
+        """Position where the acceleration lane begins, in m; 0 without a lane."""
         return self._lane_m[0]
 
     @property
     def lane_end_m(self) -> float:
-        """Where the acceleration lane ends; 0 without one."""
+        """Position where the acceleration lane ends, in m; 0 without a lane."""
         return self._lane_m[1]
 
     @property
     def merged(self) -> bool:
-        """Whether the VUT is on the mainline; without an acceleration lane it is from M on."""
+        """Whether the VUT is on the mainline; without an acceleration lane, whether it is at M."""
         return self._merged if self.lane_begin_m < self.lane_end_m else self.x_vut_m >= 0.0
 
     @property
     def may_merge(self) -> bool:
-        """Whether a merge request, now, puts the VUT on the mainline in the next step.
+        """Whether a merge request at this step moves the VUT to the mainline in the next step.
 
         False after the merge, and without an acceleration lane.
         """

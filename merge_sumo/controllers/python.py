@@ -394,9 +394,9 @@ class BatchedDriver(ControllerDriver):
 
 @dataclass(frozen=True, slots=True)
 class SeenBatch:
-    """Observation of a batched VUT: like `Seen`, with arrays over the K corridors, (K,).
+    """The observation of a batched controller: as `Seen`, with an array over K corridors.
 
-    The arrays are copies.
+    Each array has the shape (K,) unless stated otherwise, and is a copy.
 
     Example:
         ```python
@@ -405,17 +405,17 @@ class SeenBatch:
         ```
 
     Attributes:
-        active: whether an episode runs in the corridor; elsewhere the numbers mean nothing.
-        t_s: time since the episode began.
-        x_pov_m: distance of the POV's front bumper to M along its lane, negative before M.
-        v_pov_mps: speed of the POV.
-        x_vut_m: distance of the VUT's front bumper to M along its lane, negative before M.
-        v_vut_mps: speed of the VUT.
-        x_others_m: positions of all cars of the mainline, the one in front first, (cars, K).
-        v_others_mps: their speeds, (cars, K).
-        lane_begin_m: where the acceleration lane begins; 0 without one.
-        lane_end_m: where it ends; 0 without one.
-        merged: whether the VUT is on the mainline; without an acceleration lane it is from M on.
+        active: whether an episode runs in the corridor; if not, its numbers have no meaning.
+        t_s: time since the begin of the episode, in s.
+        x_pov_m: position of the POV's front bumper, in m; 0 at M, negative before M.
+        v_pov_mps: speed of the POV, in m/s.
+        x_vut_m: position of the VUT's front bumper, in m; 0 at M, negative before M.
+        v_vut_mps: speed of the VUT, in m/s.
+        x_others_m: positions of all cars on the mainline, the first one ahead, (cars, K), in m.
+        v_others_mps: speeds of these cars, (cars, K), in m/s.
+        lane_begin_m: position where the acceleration lane begins, in m; 0 without a lane.
+        lane_end_m: position where the acceleration lane ends, in m; 0 without a lane.
+        merged: whether the VUT is on the mainline; without a lane, whether it is at M.
     """
 
     active: NDArray[np.bool_]
@@ -436,7 +436,7 @@ class SeenBatch:
 
         Args:
             scene: the state of all corridors.
-            lanes_m: begin and end of the acceleration lanes, (2, K); 0 and 0 without one.
+            lanes_m: begin and end of the acceleration lanes, (2, K), in m; 0 and 0 without a lane.
         """
         scene, (begin_m, end_m) = copy.deepcopy(scene), lanes_m.copy()
         x_m, v_mps = np.delete(scene.x_m, VUT, axis=0), np.delete(scene.v_mps, VUT, axis=0)
@@ -460,7 +460,7 @@ class SeenBatch:
 
     @property
     def may_merge(self) -> NDArray[np.bool_]:
-        """Whether a merge request, now, puts the VUT on the mainline in the next step, (K,)."""
+        """Whether a merge request moves the VUT to the mainline in the next step, (K,)."""
         has_lane = self.lane_begin_m < self.lane_end_m
         next_m = self.x_vut_m + self.v_vut_mps * DT_S
         may: NDArray[np.bool_] = has_lane & ~self.merged & (next_m >= self.lane_begin_m)

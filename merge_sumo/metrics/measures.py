@@ -173,8 +173,10 @@ class Measures:
         values: the computed values, by name.
 
     Example:
-        >>> measures = Measures.of(trajectory)
-        >>> measures.severity, measures.ttc_s
+        ```python
+        measures = Measures.of(trajectory)
+        print(measures.severity, measures.ttc_s)
+        ```
     """
 
     encounter: Encounter = NONE_MET

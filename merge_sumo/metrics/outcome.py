@@ -64,20 +64,22 @@ class Prediction(Record, frozen=True):
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """The result of a case: its measures and its margin.
+    """The outcome of a case: its measures and its margin.
 
     Attributes:
-        index: place of the case in its campaign; in its chunk until `Episode.at` sets it.
-        batch: batch in which the case ran.
+        index: number of the case in its campaign, from 0.
+        batch: number of the batch in which the case ran, from 0.
         case: the case.
         measures: the measures of its episode.
-        prediction: the prediction before it ran, if there was one.
-        margin: distance from failing under the criterion of the campaign, without a unit; below 0
-            for a failure. By default that of the score P. None after an error.
+        prediction: prediction of the case before it ran; None without one.
+        margin: distance from failing by the failure criterion, without a unit; below 0 the case
+            fails. The default is the margin of the score P. None after an error.
 
     Example:
-        >>> outcome = ms.run(vut="design2", level=1, x_pov0_m=-290, v_pov0_mps=30).outcome
-        >>> outcome.failed, outcome.margin, outcome.measures.ttc_s
+        ```python
+        outcome = ms.run("design2", level=1, x_pov0_m=-290, v_pov0_mps=30).outcome
+        print(outcome.failed, outcome.margin, outcome.measures.ttc_s)
+        ```
     """
 
     index: int
@@ -88,37 +90,37 @@ class Outcome:
     margin: float | None = None
 
     def __post_init__(self) -> None:
-        """Take the margin of the score by default."""
+        """Use the margin of the score as the default."""
         if self.margin is None:
             object.__setattr__(self, "margin", margin_of(self.measures.score))
 
     @property
     def failed(self) -> bool:
-        """Whether the case is a failure of the VUT: its margin is below 0."""
+        """Whether the case fails: its margin is below 0."""
         return self.margin is not None and self.margin < 0.0
 
     @property
     def is_by_score(self) -> bool:
-        """Whether the margin is that of the score."""
+        """Whether the margin is the margin of the score."""
         return self.margin == margin_of(self.measures.score)
 
     @property
     def is_tested(self) -> bool:
-        """Whether the VUT reached the merge point or failed; other cases are not judged."""
+        """Whether the case is judged: the VUT reached the merge point, or the case failed."""
         return self.measures.end is End.MERGED or self.failed
 
     @property
     def passes(self) -> bool:
-        """Whether the VUT reached the merge point, and the case is not a failure."""
+        """Whether the case passes: it is judged, and does not fail."""
         return self.is_tested and not self.failed
 
     @property
     def signed_gap(self) -> float | None:
-        """The gap at M in units of the scenario's limit; a case fails within -1 to 1.
+        """The gap at M, divided by the limit of the scenario; from -1 to 1 the case fails.
 
-        Under another criterion than the paper's, the margin m is expressed as such a gap: 1 + m for
-        m >= 0, and 1 / (1 - m) for m < 0. Negative where the VUT goes first. None after an error,
-        and without a gap under the paper's criterion.
+        It is negative if the VUT is first. With another criterion than the paper's, the margin m
+        becomes a gap: 1 + m if m >= 0, and 1 / (1 - m) if m < 0. None after an error, and if the
+        paper's criterion has no gap.
         """
         dx_m, margin = self.measures.dx_m, self.margin
         if margin is None or self.is_by_score:
@@ -127,7 +129,7 @@ class Outcome:
         return -gap if dx_m is not None and dx_m < 0.0 else gap
 
     def to_record(self) -> dict[str, Any]:
-        """Return the line of `outcomes.jsonl`: flat, with units in the names."""
+        """Return the record of the case in `outcomes.jsonl`, with units in the names."""
         scenario = self.case.scenario
         record: dict[str, Any] = {"index": self.index, "batch": self.batch}
         for name in ("level", *scenario.case_fields):
@@ -146,7 +148,7 @@ class Outcome:
         """Return the trajectory of the case from its recorded motion.
 
         Args:
-            whole: motion up to M and after it, (T + 1, A, 3).
+            whole: motion up to M and after it, (T + 1, A, 3), as in `Trajectory`.
             signals: signals of the VUT.
         """
         found = self.measures
@@ -163,7 +165,7 @@ class Outcome:
             scenario: scenario of the campaign.
 
         Raises:
-            UserError: the line is not such a record.
+            UserError: the line is not a record of a case.
         """
         known = convert(decode(line), record_of(scenario))
         coordinates = {name: getattr(known, name) for name in ("level", *scenario.case_fields)}

@@ -16,35 +16,40 @@ from merge_sumo.scenario.case import Case, FloatArray, Pool, to_unit
 
 
 class Sampler(ABC):
-    """Proposes the cases of a campaign, and learns from their outcomes; it simulates nothing.
+    """Proposes the cases of a campaign, and learns from their outcomes.
 
-    `ask` is a pure function of the settings, of the outcomes told so far, and of the pending cases:
-    two calls return the same cases, and neither the order of outcomes nor a repeated `tell`
-    matters. A campaign resumes by telling the outcomes of its journal to a new sampler.
+    A sampler does not simulate. For each batch, a campaign calls these methods:
 
-    A new sampler implements `ask`, or as a `LevelwiseSampler` only `propose`. It may call
-    `history`, `pending`, `observed`, `proposed`, `shares` and `rng`. For each batch a campaign
-    calls `batch_size`, `ask`, `prediction` of each case and `set_pending`; once the batch has run,
-    `tell` and `set_pending`.
+    1. `batch_size`, `ask`, `prediction` for each case, and `set_pending`.
+    2. After the batch has run: `tell` and `set_pending`.
+
+    `ask` is a pure function of the settings, of the outcomes so far, and of the pending cases. Two
+    calls return the same cases. The order of the outcomes and a repeated `tell` have no influence.
+    A campaign resumes by telling the recorded outcomes to a new sampler.
+
+    To write a sampler, implement `ask`, or subclass `LevelwiseSampler` and implement `propose`. The
+    methods `history`, `pending`, `observed`, `proposed`, `shares` and `rng` are there for you.
 
     Attributes:
-        about: what it does, in a line without a full stop, for help and documentation.
+        about: the method in one line without a full stop, for help and documentation.
         colour: colour of its curves in figures, #RRGGBB.
         learns: whether proposals depend on the outcomes, and not only on their number.
         uses_predictions: whether proposals depend on the predictions of a `Predictor`.
-        overlaps: whether it proposes while cases run, and avoids the neighbourhood of these.
-        tolerated: share of the runs of a case that may fail before the case counts as failed.
+        overlaps: whether it proposes while cases run, and avoids their neighbourhood.
+        tolerated: share of the runs of a case that may fail before the case counts as a failure.
         pool: the cases to choose from.
         seed: seed of all random numbers.
         predictor: predicts cases before they run; None without `uses_predictions`.
 
     Example:
+        ```python
         sampler = make_sampler("coverage", pool, seed=1)
         for batch in range(3):
             outcomes = []
             for index, episode in enumerate(simulate(plan, sampler.ask(15)), 15 * batch):
                 outcomes.append(episode.at(index, batch).outcome)
             sampler.tell(outcomes)
+        ```
     """
 
     about: ClassVar[str] = ""
@@ -60,8 +65,7 @@ class Sampler(ABC):
         Args:
             pool: the cases to choose from.
             seed: the same seed gives the same proposals.
-            predictor: predicts cases before they run; other samplers than those with
-                `uses_predictions` ignore it.
+            predictor: predicts cases before they run; ignored without `uses_predictions`.
         """
         self.pool = pool
         self.seed = seed
@@ -85,10 +89,10 @@ class Sampler(ABC):
         """Return the prediction of a case of the last `ask`.
 
         Args:
-            position: its position in the returned list, from 0.
+            position: position of the case in the returned list, from 0.
 
         Returns:
-            The prediction; None where the case was not predicted.
+            The prediction; None if the case was not predicted.
         """
         return None
 
@@ -102,9 +106,9 @@ class Sampler(ABC):
         """Learn from outcomes.
 
         Args:
-            outcomes: outcomes in any order. Those without a verdict, VUT_ERROR and SIM_ERROR, only
-                count as proposed. An outcome replaces an earlier one of the same index.
-            motions: their motions, (T + 1, A, 3), by index, for the predictor; None without one.
+            outcomes: outcomes in any order. Errors (VUT_ERROR and SIM_ERROR) only count as
+                proposed. An outcome replaces an earlier outcome with the same index.
+            motions: motions of the cases, (T + 1, A, 3), by index, for the predictor.
         """
         for outcome in outcomes:
             if outcome.index not in self._outcomes:
@@ -116,10 +120,10 @@ class Sampler(ABC):
     def set_pending(self, cases: Iterable[Case]) -> None:
         """Replace the pending cases.
 
-        They count as proposed, and a sampler that `overlaps` avoids their neighbourhood.
+        Pending cases count as proposed. A sampler that `overlaps` avoids their neighbourhood.
 
         Args:
-            cases: all cases that were proposed and have no outcome yet.
+            cases: all proposed cases without an outcome.
         """
         self._pending = list(cases)
 
@@ -127,7 +131,7 @@ class Sampler(ABC):
         """Return the pending cases of a level.
 
         Args:
-            level: level of the POV.
+            level: POV level.
 
         Returns:
             Points of the unit cube of the level, (m, d).
@@ -136,10 +140,10 @@ class Sampler(ABC):
         return to_unit(cases, level, self.pool.scenario)
 
     def observed(self, level: int | None = None) -> list[Outcome]:
-        """Return the outcomes with a verdict, in order of their index.
+        """Return the outcomes without errors, in the order of their index.
 
         Args:
-            level: level of the POV; None for all levels.
+            level: POV level; None for all levels.
         """
         observed = []
         for index in sorted(self._outcomes):
@@ -149,10 +153,10 @@ class Sampler(ABC):
         return observed
 
     def proposed(self, level: int | None = None) -> int:
-        """Return the number of cases that were told or are pending.
+        """Return the number of cases so far, with the pending cases.
 
         Args:
-            level: level of the POV; None for all levels.
+            level: POV level; None for all levels.
         """
         if level is None:
             return self._proposed.total() + len(self._pending)
@@ -160,10 +164,10 @@ class Sampler(ABC):
         return self._proposed[level] + len(pending)
 
     def history(self, level: int) -> LevelHistory:
-        """Return the cases of a level that have a verdict as arrays, with a row for each case.
+        """Return the cases of a level without errors as arrays, with a row for each case.
 
         Args:
-            level: level of the POV.
+            level: POV level.
         """
         of_all_levels = by_case(self.observed())
         cases = [case for case in of_all_levels if case.case.level == level]
@@ -188,19 +192,21 @@ class Sampler(ABC):
     def shares(self, n: int, weights: Mapping[int, float] | None = None) -> dict[int, int]:
         """Divide a batch among the levels (Wang et al., section V-D).
 
-        Each level first gets one case; with fewer cases than levels, the levels with the fewest
-        proposed cases get them. The rest is divided by the largest remainders.
+        Each level first gets one case. With fewer cases than levels, the levels with the fewest
+        proposed cases get one. The method of largest remainders divides the rest.
 
         Args:
             n: number of cases.
-            weights: positive weights by level; equal ones by default.
+            weights: positive weights by level; equal weights by default.
 
         Returns:
             Numbers of cases by level; their sum is `n`.
 
         Example:
+            ```pycon
             >>> make_sampler("coverage", Pool(levels=(0, 1, 2), scenario=US23), seed=1).shares(5)
             {0: 2, 1: 2, 2: 1}
+            ```
         """
         weights = weights or dict.fromkeys(self.pool.levels, 1.0)
         by_need = sorted(weights, key=lambda level: (self.proposed(level), level))
@@ -216,24 +222,26 @@ class Sampler(ABC):
     def rng(self, *key: int) -> np.random.Generator:
         """Return the random generator of the next proposal.
 
-        It depends on the seed and on the number of cases proposed so far. Cases without a verdict
-        count, so that a batch of errors is not proposed again.
+        It depends on the seed and on the number of proposed cases. Errors count, so that a batch of
+        errors is not proposed again.
 
         Args:
-            key: distinguishes generators of one proposal, as those of its levels.
+            key: numbers that distinguish generators of one proposal, for example the level.
         """
         return np.random.default_rng([self.seed, self.proposed(), *key])
 
 
 class LevelwiseSampler(Sampler):
-    """Divides a batch among the levels, then proposes points of the unit cube of each level.
+    """A sampler that divides a batch among the levels, and proposes points for each level.
 
     Example:
+        ```python
         class RandomSampler(LevelwiseSampler):
             about = "draws cases at random"
 
             def propose(self, history, n, rng, level):
                 return rng.random((n, history.dims))
+        ```
     """
 
     def ask(self, n: int) -> list[Case]:
@@ -253,7 +261,7 @@ class LevelwiseSampler(Sampler):
         """Return the number of cases for each level.
 
         Args:
-            n: number of cases of the batch, which is the sum over the levels.
+            n: number of cases of the batch: the sum over the levels.
         """
         return self.shares(n)
 
@@ -264,10 +272,10 @@ class LevelwiseSampler(Sampler):
         """Propose points of the unit cube of a level.
 
         Args:
-            history: outcomes of the level; a point has `history.dims` coordinates, d.
+            history: outcomes of the level. A point has d = `history.dims` coordinates.
             n: number of points.
             rng: random generator of this proposal.
-            level: level of the POV.
+            level: POV level.
 
         Returns:
             Points, (n, d).

@@ -74,15 +74,19 @@ def played(kind: type[Sampler], pool: Pool) -> tuple[Sampler, list[Outcome], lis
 
 
 class SamplerContract:
-    """The properties of a sampler that a campaign relies on: a pure function of seed and history.
+    """Tests of the properties of a sampler that a campaign needs. pytest runs them.
+
+    Above all, `ask` must be a pure function of the seed and the outcomes.
 
     Attributes:
         sampler: the class under test.
         pool: the cases to choose from.
 
     Example:
+        ```python
         class TestMySampler(SamplerContract):
             sampler = MySampler
+        ```
     """
 
     sampler: type[Sampler]
@@ -97,7 +101,7 @@ class SamplerContract:
         return self.sampler(self.pool, seed)
 
     def played(self) -> tuple[Sampler, list[Outcome], list[Case]]:
-        """Return a sampler with a history, this history, and its next proposal."""
+        """Return a sampler with outcomes, these outcomes, and its next proposal."""
         return played(self.sampler, self.pool)
 
     def test_says_in_a_line_what_it_does(self) -> None:
@@ -111,7 +115,7 @@ class SamplerContract:
             assert len(self.played()[0].ask(n)) == n
 
     def test_proposes_cases_of_the_pool_in_plain_numbers(self) -> None:
-        """A record holds Python's numbers, and a case lies in the box of its level."""
+        """A record needs numbers of Python, and a case must be in the pool of its level."""
         for case in self.fresh(1).ask(30) + self.played()[0].ask(20):
             assert case.level in self.pool.levels
             assert type(case.level) is int
@@ -133,7 +137,7 @@ class SamplerContract:
         assert sampler.ask(9) == proposed
 
     def test_does_not_depend_on_the_order_of_the_history_nor_on_a_repetition(self) -> None:
-        """Workers end their cases in any order, and a resumed campaign may tell a case again."""
+        """Workers finish cases in any order, and a resumed campaign can tell a case again."""
         _, outcomes, proposed = self.played()
         order = np.random.default_rng(0).permutation(len(outcomes))
         shuffled = [outcomes[i] for i in order]
@@ -145,7 +149,7 @@ class SamplerContract:
         assert shuffled == before
 
     def test_proposes_other_cases_after_batches_without_a_verdict(self) -> None:
-        """A case that ends the process of the VUT is not proposed again and again."""
+        """The sampler must not propose a case that ends the process of the VUT forever."""
         for history in ([], self.played()[1]):
             sampler, seen = self.fresh(), set[Case]()
             sampler.tell(history)
@@ -169,7 +173,7 @@ class SamplerContract:
         assert resumed.ask(9) == proposed
 
     def test_proposes_other_cases_while_cases_run(self) -> None:
-        """Pending cases are proposed, and neither proposed again nor learned from."""
+        """The sampler must not propose pending cases again, or learn from them."""
         _, outcomes, proposed = self.played()
         first = [outcome for outcome in outcomes if outcome.batch == 0]
         pending = [outcome.case for outcome in outcomes if outcome.batch > 0]

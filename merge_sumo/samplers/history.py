@@ -13,26 +13,29 @@ from merge_sumo.scenario.case import FloatArray
 
 @dataclass(frozen=True, slots=True)
 class LevelHistory:
-    """The N cases of one POV level that have a verdict, in the order of their first run.
+    """The N cases of one POV level without errors, in the order of their first run.
 
-    A case that ran several times has one row, with the margin and the gap of its worst run:
-    a surrogate learns from these where cases can fail, and from `failures` and `runs` how often.
+    A case that ran several times has one row, with the margin and the gap of its worst run. From
+    these a surrogate learns where cases can fail. From `failures` and `runs` it learns how often.
 
     Example:
+        ```python
         history = sampler.history(level=1)
-        chance = len(history.failing) / len(history.points)
+        share = len(history.failing) / len(history.points)
+        ```
 
     Attributes:
         points: cases in the unit cube, (N, d).
-        margin: margin of the worst run, below 0 for a failure, (N,); large ones are `bounded`.
+        margin: margin of the worst run, below 0 for a failure, (N,); large margins are compressed
+            to at most 2.5 (`bounded`).
         failed: whether more than the tolerated share of the runs failed, (N,).
-        gap: signed gap of the worst run, (N,), a failure within -1 and 1 (`Outcome.signed_gap`);
-            NaN where the VUT never arrived.
+        gap: signed gap of the worst run, (N,); from -1 to 1 the run fails (`Outcome.signed_gap`).
+            NaN if the VUT never arrived.
         batch: number of the batch in which the case ran first, (N,).
         runs: number of runs of each case, (N,).
         failures: number of runs that failed, (N,).
         variance: variance of the margin over the runs of a case, (N,); NaN for a single run.
-        varies: whether runs of a case differ, at this level or another.
+        varies: whether the runs of any case differ, at any level.
     """
 
     points: FloatArray
@@ -52,14 +55,14 @@ class LevelHistory:
 
     @property
     def failing(self) -> FloatArray:
-        """Cases that failed, (m, d)."""
+        """The points of the cases that failed, (m, d)."""
         return self.points[self.failed]
 
     def rows(self, chosen: IntArray) -> LevelHistory:
         """Return the history of some of the cases.
 
         Args:
-            chosen: row numbers of these cases, (m,).
+            chosen: numbers of the rows, (m,).
         """
         arrays: dict[str, Any] = {}
         for field in fields(self):

@@ -38,28 +38,30 @@ MOST_SVO_RAD = math.nextafter(SVO.high, 0.0)
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Case:
-    """One test case: a start of a scenario, in the pool or outside.
+    """One case: a start of a scenario, in the pool or outside it.
 
     Attributes:
-        level: level of reasoning of the POV; `OWN` for a POV of the user.
-        svo_rad: social value orientation of the POV; None except at level 2.
-        x_pov0_m: lane coordinate of the POV at the start.
-        v_pov0_mps: speed of the POV at the start.
-        v_vut0_mps: speed of the VUT at the start.
-        headway_ahead_s: time headway of the POV to the car ahead of it; None without traffic.
-        headway_behind_s: time headway of the car behind the POV; None without traffic.
-        sense_delay_s: number for the range `delay_s` of the `sense` of the scenario; None where it
-            is not a range. The other `sense_...` and `act_...` are alike.
-        draw: number of the draw of random values in the episode; not a coordinate of the pool.
+        level: POV level, 0 to 2; `OWN` for your own POV.
+        svo_rad: psi, the social value orientation of the POV, in rad; None except at level 2.
+        x_pov0_m: position of the POV at the start, in m; negative before M.
+        v_pov0_mps: speed of the POV at the start, in m/s.
+        v_vut0_mps: speed of the VUT at the start, in m/s.
+        headway_ahead_s: time headway from the POV to the car ahead, in s; None without traffic.
+        headway_behind_s: time headway from the car behind to the POV, in s; None without traffic.
+        sense_delay_s: value of `delay_s` of the scenario's `sense`, if that is a range; else None.
+            The other attributes `sense_...` and `act_...` follow the same rule.
+        draw: number of the draw of random values. It is not a coordinate of the pool.
         scenario: the scenario.
 
     Raises:
         UserError: the scenario cannot start with these values.
 
     Example:
+        ```pycon
         >>> case = Case(level=0, x_pov0_m=-250.0, v_pov0_mps=30.0, scenario=US23)
         >>> case.starts()
         [(-250.0, 30.0), (-182.0, 18.0)]
+        ```
     """
 
     level: int
@@ -82,7 +84,7 @@ class Case:
     scenario: Scenario = field(repr=False)
 
     def __post_init__(self) -> None:
-        """Check that the scenario can start with the numbers."""
+        """Check that the scenario can start with these values."""
         if self.level not in ALL_LEVELS:
             raise UserError(
                 f"level is {self.level}: choose 0, 1 or 2, or {OWN} for a POV of your own"
@@ -125,17 +127,17 @@ class Case:
 
     @property
     def sensing(self) -> Sensing:
-        """Sensing of the VUT in this case, without ranges."""
+        """The sensing of the VUT in this case, with numbers in the place of ranges."""
         return self.scenario.sense.in_case(self, SENSE)
 
     @property
     def actuation(self) -> Actuation:
-        """Actuation of the VUT in this case, without ranges."""
+        """The actuation of the VUT in this case, with numbers in the place of ranges."""
         return self.scenario.act.in_case(self, ACT)
 
     @property
     def start(self) -> Case:
-        """The case with draw 0."""
+        """The same case with draw 0."""
         return self if self.draw == 0 else replace(self, draw=0)
 
     @property
@@ -145,7 +147,7 @@ class Case:
 
     @property
     def controller_seed(self) -> int:
-        """Seed for the controller, which knows neither level nor orientation, below 2**32."""
+        """Seed for the controller, below 2**32; it does not reveal level and psi of the POV."""
         return self._hashed([(float(x), float(v)) for x, v in self.starts()])
 
     def _hashed(self, known: object) -> int:
@@ -190,16 +192,18 @@ class ObservedCase(Case):
 
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Pool:
-    """The cases from which a campaign chooses.
+    """All possible starts, from which a campaign chooses its cases.
 
     Attributes:
-        levels: levels of the POV.
-        scenario: the scenario of all cases.
+        levels: POV levels.
+        scenario: scenario of all cases.
 
     Example:
+        ```pycon
         >>> pool = Pool(levels=(0,), scenario=US23)
         >>> pool.cases(np.array([[0.5, 0.5]]), 0)[0].x_pov0_m
         -260.0
+        ```
     """
 
     levels: tuple[int, ...]
@@ -210,7 +214,7 @@ class Pool:
 
         Args:
             points: coordinates between 0 and 1, (n, d).
-            level: level of the cases.
+            level: POV level of the cases.
         """
         return from_unit(points, level, scenario=self.scenario)
 

@@ -51,25 +51,29 @@ def as_reason(text: str) -> str:
 class Trajectory:
     """Positions, speeds and accelerations of all vehicles in one episode.
 
-    A motion has shape (T + 1, A, 3): one row per step, from t = 0 to the end; the vehicles POV, VUT
-    and, in traffic, the cars ahead of and behind the POV; x in m, v in m/s and a in m/s2. The
-    acceleration of a row acts until the next row, and is 0 in the last one.
+    A motion is an array of shape (T + 1, A, 3):
+
+    - one row for each step of 0.1 s, from t = 0 to the end;
+    - A vehicles: POV, VUT and, in traffic, the cars ahead of and behind the POV;
+    - x in m, v in m/s and a in m/s2. The acceleration of a row acts until the next row, and is 0 in
+      the last row.
 
     Attributes:
         case: the case.
         motion: motion up to M.
-        end: reason of the end. It is MERGED whenever the VUT arrived at M, also after a contact.
-        error: fault of the VUT or of the simulation; None without one. A case that MERGED has the
-            fault after M.
-        clipped_steps: number of answers of the VUT that were clipped to its limits.
-        after: motion after M, from the row of the merge; None without a follow-up.
-        signals: signals of the VUT for each row of `whole`; None without any.
-        in_vain: commands of the VUT that were accepted and had no effect.
+        end: reason of the end. It is MERGED whenever the VUT reached M, also after a contact.
+        error: message of an error of the controller or of the simulation; None without an error. If
+            `end` is MERGED, the error happened after M.
+        clipped_steps: number of steps in which the answer of the VUT was clipped to its limits.
+        after: motion after M, from the row of the merge on; None without a follow-up.
+        signals: signals of the VUT for each row of `whole`; None without signals.
+        in_vain: TraCI commands of the VUT that were accepted without effect.
 
     Example:
-        >>> trajectory = run.recorded.trajectory(0)
-        >>> trajectory.x_vut_m[0], trajectory.t_end_s
-        (-182.0, 8.7)
+        ```python
+        trajectory = run.trajectory(0)
+        print(trajectory.x_vut_m[0], trajectory.t_end_s)
+        ```
     """
 
     case: Case
@@ -82,7 +86,7 @@ class Trajectory:
     in_vain: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
-        """Return the size and the end of the motion, which has hundreds of numbers."""
+        """Return the size and the end of the motion, without its numbers."""
         cars, rows = self.motion.shape[1], len(self.motion)
         return f"<Trajectory: {cars} vehicles, {rows} rows, {self.end} at {self.t_end_s:.1f} s>"
 
@@ -125,11 +129,11 @@ class Trajectory:
 
     @property
     def nearest(self) -> int:
-        """Index of the car of the mainline that is nearest to the VUT at the end of `motion`."""
+        """Index of the car on the mainline that is nearest to the VUT at the end of `motion`."""
         return self.nearest_at(len(self.motion) - 1)
 
     def nearest_at(self, row: int) -> int:
-        """Return the index of the car of the mainline that is nearest to the VUT.
+        """Return the index of the car on the mainline that is nearest to the VUT.
 
         Args:
             row: row of `whole`.

@@ -61,17 +61,18 @@ COMPARED = 3
 
 @dataclass(frozen=True, slots=True, repr=False)
 class Replay(Result):
-    """The comparison of a replay with its record.
+    """The comparison of a replay with the recorded motion. `ms.replay` returns it.
 
     Attributes:
-        rows: number of compared rows, over all vehicles.
-        diverged_at_s: time of the first row that differs; None where the replay is identical.
-        detail: the difference in words.
-        words: lines on the case, its timeline, and a later begin.
+        rows: number of rows that were compared, over all vehicles.
+        diverged_at_s: time of the first row that differs, in s; None if the replay is identical.
+        detail: the difference, in words.
+        words: lines about the case: its timeline, and a later begin of the replay.
 
     Example:
-        >>> ms.replay("scenarios/pov-yields").identical
-        True
+        ```python
+        assert ms.replay("scenarios/pov-yields").identical
+        ```
     """
 
     computed = ("identical",)
@@ -88,7 +89,7 @@ class Replay(Result):
 
     @property
     def identical(self) -> bool:
-        """Whether no row differs."""
+        """Whether all rows are equal."""
         return self.diverged_at_s is None
 
     def lines(self) -> list[str]:

@@ -53,10 +53,10 @@ class PolicyCheck:
         cases: number of cases.
         mean_return: mean return of the driver, played in SUMO.
         mean_best: mean return of the best response.
-        mean_level0: mean return of level-0 behaviour in place of the driver.
-        mean_regret: mean of best - return, as a share of the mean gain of the best response over
-            level-0 behaviour.
-        p99_regret: 99th percentile of the regret, as a share of the same mean gain.
+        mean_level0: mean return of level-0 behaviour in the place of the driver.
+        mean_regret: mean of the best return minus the return, divided by the mean gain of the best
+            response over level-0 behaviour.
+        p99_regret: 99th percentile of the regret, divided by the same gain.
         collisions: number of collisions.
         avoidable_collisions: collisions in cases where the best response has none.
     """
