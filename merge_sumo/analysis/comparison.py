@@ -330,7 +330,7 @@ class Comparison(Result):
 
     @property
     def worse(self) -> bool:
-        """Whether a case got worse, a version passes less often, or no case is judged at last."""
+        """Whether a case got worse, a version passes less often, or the last has no judged case."""
         for one in self.version_changes:
             if one.passes_less or one.groups["worse"]:
                 return True

@@ -149,7 +149,7 @@ class SamplerContract:
         assert shuffled == before
 
     def test_proposes_other_cases_after_batches_without_a_verdict(self) -> None:
-        """The sampler must not propose a case that ends the process of the VUT forever."""
+        """The sampler must not keep proposing a case that ends the controller's process."""
         for history in ([], self.played()[1]):
             sampler, seen = self.fresh(), set[Case]()
             sampler.tell(history)
