@@ -117,15 +117,15 @@ counts: a model that crosses over merges.
 - The limits of the scenario clip the speed. `clipped_steps` counts clipped steps up to M, and \
 `getSpeed` returns the driven speed. A model must continue from that speed. A negative speed is \
 refused. A speed that is not a number ends the case as an error.
-- In SUMO `getSpeed` returns in such a loop the speed that the driver of SUMO chose. Here use \
-`getSpeedWithoutTraCI`, which returns that speed of the last step (after `setSpeed("vut", -1)`).
+- In such a loop, plain SUMO returns from `getSpeed` the speed that its driver chose. Here \
+`getSpeedWithoutTraCI` returns that speed, of the last step (after `setSpeed("vut", -1)`).
 - Leave out `--act`, which adds its own delay and lag. A model with a first-order lag of 0.3 s \
 drives as the law without the model and with `--act lag_s=0.3`, to 1e-6 m (`pytest \
 tests/controllers/test_traci_commands.py -k VehicleModel`).
 
 ## Lane changes
 
-- Edges and lanes are those of the net file. In `us23-lane`, both lanes are on the edge `lane`, \
+- Edges and lanes come from the net file. In `us23-lane`, both lanes are on the edge `lane`, \
 and lane 0 is the acceleration lane. `getLanePosition`, `getNeighbors`, `getLeftFollowers`, \
 `couldChangeLane` and similar functions use these lanes.
 - `vut` departs in lane change mode 0: only the controller changes its lane. `changeLane` and \

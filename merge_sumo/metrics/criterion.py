@@ -129,12 +129,12 @@ class Criterion:
 
     @property
     def is_of_paper(self) -> bool:
-        """Whether it is the criterion of the paper, whose margin is that of the score."""
+        """Whether it is the criterion of the paper, with the margin of the score."""
         return self.fail_when == PAPER and self.require is None
 
     @property
     def uses_score(self) -> bool:
-        """Whether it is a condition on the score, whose margin may be that of the score."""
+        """Whether it is a condition on the score, so that its margin may be the score's."""
         return self.require is None and "score" in condition_of(self.condition).names
 
     def description(self, scenario: Scenario) -> str:

@@ -74,8 +74,8 @@ class Measure(Generic[T]):
         column: heading in the table All cases of the report (`allCases` in report.js); empty where
             that leaves it out.
         digits: decimals in tables.
-        missing: value in conditions where an episode has none. A measure without it is no number:
-            a condition may name it only if it is one of `criterion.TEXTS`.
+        missing: value in conditions for an episode without one. A measure without it is not a
+            number: a condition may name it only if it is one of `criterion.TEXTS`.
         worse: end of the values at which an episode is worse; None where neither end is.
         only_with: part of a scenario that the measure needs; empty for every scenario.
         default: value where none is recorded, as in a scenario without the part `only_with`.
@@ -354,7 +354,7 @@ class Measures:
         column="braking needed at M",
     )
     def brake_after_mps2(self) -> float | None:
-        """Braking with which the car behind at M does not touch the car ahead.
+        """Braking that the car behind at M needs to avoid a contact with the car ahead.
 
         It begins after a reaction time of 0.75 s, and the car ahead keeps its speed. None if no
         braking is enough, and without a merge.
@@ -424,7 +424,7 @@ class Measures:
 
     @measure(worse="high", digits=0, default=0)
     def clipped_steps(self) -> int:
-        """Number of steps in which the limits of acceleration clipped the VUT."""
+        """Number of steps with an acceleration that was clipped to the limits of the VUT."""
         return self.trajectory.clipped_steps
 
     @measure()
