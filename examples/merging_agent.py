@@ -1,9 +1,9 @@
-"""Train a merging agent with stable-baselines3, and drive by it as a VUT.
+"""Train a merging agent with stable-baselines3, and test it as a controller.
 
 python examples/merging_agent.py runs/agent.zip
 merge-sumo campaign --vut examples/merging_agent.py:Agent --level 0
 
-`docs/how-to/reinforcement-learning.md` explains it.
+`docs/how-to/reinforcement-learning.md` explains each part.
 """
 
 from __future__ import annotations
@@ -25,9 +25,10 @@ FILE = "runs/agent.zip"
 
 
 def features(state: Any) -> Any:
-    """Return what the agent sees of [x_POV, v_POV, x_VUT, v_VUT], all of the order of 1.
+    """Return the features of a state [x_POV, v_POV, x_VUT, v_VUT], each about -4 to 4.
 
-    The fourth is what decides: where the POV is as the VUT reaches M, if both keep their speeds.
+    The fourth matters most: the position of the POV when the VUT reaches M, if both keep their
+    speeds.
     """
     x_pov_m, v_pov_mps, x_vut_m, v_vut_mps = (float(value) for value in state)
     pov_at_merge_m = x_pov_m - x_vut_m * v_pov_mps / max(v_vut_mps, 1.0)
@@ -66,23 +67,23 @@ def train(file: str, decisions: int = 32_768, seed: int = 0) -> None:
 
 @cache
 def trained(file: str) -> PPO:
-    """Return the agent of a file, which all objects of a process share."""
+    """Return the agent of a file. All controllers of a process share it."""
     return PPO.load(file, device="cpu")
 
 
 class Agent:
-    """The agent at the wheel: it decides every 0.5 s, as it was trained to."""
+    """A controller that asks the agent every 0.5 s, as in training."""
 
     def __init__(self) -> None:
         """Load the agent."""
         self.agent = trained(FILE)
 
     def reset(self, seen: Any) -> None:
-        """Begin an episode."""
+        """Start a case without acceleration."""
         self.a_mps2 = 0.0
 
     def act(self, seen: Any) -> float:
-        """Return an acceleration; actions 0 to 6 are -4 to 2 m/s2."""
+        """Return the acceleration of the last decision. Actions 0 to 6 are -4 to 2 m/s2."""
         if round(10.0 * seen.t_s) % 5 == 0:
             state = seen.x_pov_m, seen.v_pov_mps, seen.x_vut_m, seen.v_vut_mps
             action, _ = self.agent.predict(features(state), deterministic=True)
