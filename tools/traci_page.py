@@ -119,9 +119,9 @@ counts: a model that crosses over merges.
 refused. A speed that is not a number ends the case as an error.
 - In such a loop, plain SUMO returns from `getSpeed` the speed that its driver chose. Here \
 `getSpeedWithoutTraCI` returns that speed, of the last step (after `setSpeed("vut", -1)`).
-- Leave out `--act`, which adds its own delay and lag. A model with a first-order lag of 0.3 s \
-drives as the law without the model and with `--act lag_s=0.3`, to 1e-6 m (`pytest \
-tests/controllers/test_traci_commands.py -k VehicleModel`).
+- Leave out `--act`, which adds its own delay and lag. A controller with its own \
+first-order lag of 0.3 s drives like the same controller with `--act lag_s=0.3` in place of the \
+lag, to 1e-6 m (`pytest tests/controllers/test_traci_commands.py -k VehicleModel`).
 
 ## Lane changes
 
