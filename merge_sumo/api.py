@@ -6,10 +6,10 @@ run = ms.campaign("design2", cases=400, seed=1)
 run.to_dataframe()  # of pandas
 run.report()        # path of the HTML report
 
-A VUT is a spec, as after `--vut`, or a class, a function, or an object with `act` or `act_batch`.
-Before it runs anything, each raises `UserError` with one sentence for wrong values and files, and
-for an output that exists.
-Results print as on the command line, and `to_record()` returns the object of `--json`.
+A VUT is a spec, as for `--vut`, or a class, a function, or an object with `act` or `act_batch`.
+Each function checks values and files before it runs anything. It raises `UserError` with one
+sentence if one of them is wrong, or if an output exists.
+A result prints as on the command line, and its `to_record()` returns the object of `--json`.
 """
 
 from __future__ import annotations
@@ -107,7 +107,7 @@ KEYWORDS: dict[str, Sequence[str]] = {}
 
 
 def checked(function: Callable[P, R], name: str = "") -> Callable[P, R]:
-    """Decorate a function so that a keyword which it does not have raises a `UserError`.
+    """Decorate a function so that it raises `UserError` for an unknown keyword.
 
     Args:
         function: the function.
@@ -130,13 +130,14 @@ def checked(function: Callable[P, R], name: str = "") -> Callable[P, R]:
 
 
 def verb(config: Callable[P, C]) -> Callable[[Callable[[C], R]], Callable[P, R]]:
-    """Decorate a function of one config, so that callers pass the fields of that as arguments.
+    """Decorate a function of one config, so that callers pass the fields of the config instead.
 
     Args:
-        config: dataclass of the fields
+        config: dataclass of the fields.
 
     Returns:
-        The decorator; the function that it makes shows the fields and their docstrings in `help`.
+        The decorator. `help` of the decorated function shows the docstring of the config, the
+        fields under `Args:`, and the docstring of the function without its first line.
     """
 
     def decorated(work: Callable[[C], R]) -> Callable[P, R]:
@@ -149,36 +150,39 @@ def verb(config: Callable[P, C]) -> Callable[[Callable[[C], R]], Callable[P, R]]
 
         update_wrapper(call, work)
         # What `help` shows.
-        signature = inspect.signature(config).replace(
+        vars(call)["__signature__"] = inspect.signature(config).replace(
             return_annotation=work.__annotations__["return"]
         )
-        vars(call)["__signature__"] = signature
-        call.__doc__ = f"{inspect.getdoc(config)}\n\nArgs:\n{_arguments(config)}"
+        call.__doc__ = (
+            f"{inspect.getdoc(config)}\n\nArgs:{_arguments(config)}\n"
+            + str(inspect.getdoc(work)).partition("\n")[2]
+        )
         return call
 
     return decorated
 
 
 def _arguments(config: Any) -> str:
-    """Return the fields of a config with the docstrings under them."""
-    lines = []
+    """Return the fields of a config and their docstrings, as lines under `Args:`."""
+    text = ""
     for field in fields(config):
         owner = next(kind for kind in config.__mro__ if field.name in kind.__annotations__)
-        lines.append(f"    {field.name}: {_docstrings()[owner.__name__, field.name]}")
-    return "\n".join(lines)
+        text += f"\n    {field.name}: {_docstrings()[owner.__name__, field.name]}"
+    return text
 
 
 @cache
 def _docstrings() -> dict[tuple[str, str], str]:
-    """Return the docstrings under the fields, by the name of the class and that of the field."""
+    """Return the docstrings under the fields, by the names of the class and of the field."""
     found = {}
     for kind in ast.parse(inspect.getsource(c)).body:
         if not isinstance(kind, ast.ClassDef):
             continue
         for field, text in pairwise(kind.body):
             if isinstance(field, ast.AnnAssign) and isinstance(text, ast.Expr):
-                name = ast.unparse(field.target)
-                found[kind.name, name] = " ".join(ast.literal_eval(text.value).split())
+                found[kind.name, ast.unparse(field.target)] = inspect.cleandoc(
+                    ast.literal_eval(text.value)
+                ).replace("\n", "\n        ")
     return found
 
 
@@ -187,7 +191,19 @@ def _docstrings() -> dict[tuple[str, str], str]:
 
 @verb(c.Campaign)
 def campaign(config: c.Campaign) -> CampaignRun:
-    """Test a VUT and return the campaign, also one without failures."""
+    """Test a VUT and return the campaign, whether or not cases fail.
+
+    Returns:
+        The campaign: `failures` lists the failing cases, and `report()` writes the report again.
+
+    Raises:
+        UserError: a value or a file is wrong, or the folder `out` exists.
+
+    Example:
+        run = ms.campaign("design2", cases=400, seed=1)
+        for case in run.failures:
+            print(case["index"], case["x_pov0_m"])
+    """
     settings = settings_from_config(config)
     folder = dated(settings.vut) if config.out is None else Path(config.out)
     plan = settings.load_plan()
@@ -202,7 +218,17 @@ def campaign(config: c.Campaign) -> CampaignRun:
 
 @verb(c.Resume)
 def resume(config: c.Resume) -> CampaignRun:
-    """Continue a campaign that was stopped."""
+    """Continue a campaign that was stopped.
+
+    Returns:
+        The campaign, with its old and its new cases.
+
+    Raises:
+        UserError: the folder is not a campaign, or a setting differs from the recorded one.
+
+    Example:
+        run = ms.resume("runs/design2", cases=800)
+    """
     folder = folder_of(config.run)
     named = named_settings(config)
     settings = settings_from_folder(folder, read_settings(folder), named, resumes=True)
@@ -217,13 +243,20 @@ def resume(config: c.Resume) -> CampaignRun:
 
 @checked
 def open_run(folder: c.AnyPath) -> CampaignRun:
-    """Open the folder of a campaign.
+    """Open the folder of a campaign without running anything.
 
     Args:
-        folder: the folder
+        folder: the folder.
+
+    Returns:
+        The campaign.
 
     Raises:
-        UserError: it is not the folder of a campaign.
+        UserError: the folder is not a campaign.
+
+    Example:
+        run = ms.open_run("runs/design2")
+        print(run.summary)
     """
     return CampaignRun(folder)
 
@@ -233,7 +266,18 @@ def open_run(folder: c.AnyPath) -> CampaignRun:
 
 @verb(c.RunCase)
 def run(config: c.RunCase) -> CaseRun:
-    """Run one case and return it."""
+    """Run one case and return it.
+
+    Returns:
+        The case: its verdict, its measures and its motion.
+
+    Raises:
+        UserError: a value or a file is wrong, or the folder `out` exists.
+
+    Example:
+        result = ms.run("design2", level=2, x_pov0_m=-298.6, v_pov0_mps=34.5, svo_rad=0.62)
+        print(result)
+    """
     check_from(config.from_s)
     before = None if config.recorded is None else open_recorded(config.recorded[0])
     settings, case = planned_case(config, before)
@@ -260,25 +304,38 @@ def run(config: c.RunCase) -> CaseRun:
 
 @verb(c.Rerun)
 def rerun(config: c.Rerun) -> comparison.Comparison:
-    """Run recorded cases again with a changed VUT."""
+    """Run recorded cases again with a changed VUT.
+
+    Returns:
+        The comparison of the recorded and the new results: which cases broke, and which are fixed.
+
+    Raises:
+        UserError: a value or a file is wrong, an index has no case, or an output exists.
+
+    Example:
+        compared = ms.rerun("runs/design2", vut="design2", out="changes.html")
+        print(compared)
+    """
     before = open_recorded(config.run)
     indices = (config.indices,) if isinstance(config.indices, int) else tuple(config.indices)
     chosen = rerunning.chosen(before, indices, config.level)
-    out, junit = _new_files(config, SUFFIX if isinstance(before, cases_file.CasesFile) else PAGE)
+    file = before if isinstance(before, cases_file.CasesFile) else None
+    out, junit = _new_files(config, SUFFIX if file else PAGE)
     some = len(chosen) < len(before.outcomes)
-    if isinstance(before, cases_file.CasesFile) and out is not None and some:
-        raise UserError("`out` of a cases file has all cases: name none of them, and no level")
+    if file and out is not None and some:
+        raise UserError("`out` writes all cases of a cases file: omit indices and `level`")
     with opened_study(before, config, "cases again", len(chosen), engine=Engine.SUMO) as study:
         compared = rerunning.rerun(study, chosen)
-    if isinstance(before, cases_file.CasesFile):
-        compared = with_file(compared, before, out or before.folder)
+    if file:
+        compared = with_file(compared, file, out or file.folder)
     return _written(compared, out, junit)
 
 
 def _new_files(config: c.Rerun | c.Compare, ending: str = PAGE) -> tuple[Path | None, Path | None]:
-    """Return the new files of a comparison, whose `out` has an ending.
+    """Return the new files of a comparison: `out`, with its ending, and `junit`.
 
-    Raises `UserError` where one cannot be.
+    Raises:
+        UserError: one of them exists or has another ending.
     """
     out, junit = path_of(config.out), path_of(config.junit)
     if out is not None:
@@ -291,7 +348,7 @@ def _new_files(config: c.Rerun | c.Compare, ending: str = PAGE) -> tuple[Path | 
 def _written(
     compared: comparison.Comparison, out: Path | None, junit: Path | None
 ) -> comparison.Comparison:
-    """Write the page, or the present cases file, and JUnit, where they are wanted."""
+    """Write the page or the updated cases file, and the JUnit file, if the user names them."""
     if out is not None:
         page = compared.text or comparison_page(compared)
         write_new(out, page.encode(errors="backslashreplace"))
@@ -302,7 +359,17 @@ def _written(
 
 @verb(c.Export)
 def export(config: c.Export) -> list[Path]:
-    """Write cases of a campaign for others, and return the paths."""
+    """Write cases of a campaign as scenarios, as a table, or as a cases file.
+
+    Returns:
+        The paths of the written files.
+
+    Raises:
+        UserError: an index has no case, the format is unknown, or an output exists.
+
+    Example:
+        paths = ms.export("runs/design2", [17, 42])
+    """
     indices = config.indices
     wanted = [indices] if isinstance(indices, int) else list(indices or ())
     run = campaign_of(config.run).recorded
@@ -311,10 +378,16 @@ def export(config: c.Export) -> list[Path]:
 
 @checked
 def report(run: c.AnyRun) -> Shown:
-    """Write the report of a campaign again, and return its facts; as `merge-sumo report`.
+    """Write the report of a campaign again, as `merge-sumo report` does.
 
     Args:
         run: the campaign, or its folder.
+
+    Returns:
+        The path of the report and its facts. `to_record()` returns both as a dictionary.
+
+    Raises:
+        UserError: the folder is not a campaign.
     """
     opened_run = campaign_of(run)
     path = str(opened_run.report())
@@ -323,14 +396,21 @@ def report(run: c.AnyRun) -> Shown:
 
 @checked
 def replay(folder: c.AnyRun, index: int | None = None, *, from_s: float | None = None) -> Replay:
-    """Replay a case in SUMO and compare every row with its record; as `merge-sumo replay`.
+    """Replay a case in SUMO and compare its motion with the record, as `merge-sumo replay` does.
 
     Args:
         folder: a scenario folder, or a campaign.
-        index: the case of the campaign, which is exported where it is not yet.
-        from_s: begin so long before the first conflict, as in -3.
+        index: index of the case of the campaign. It is exported first, if necessary.
+        from_s: start relative to the first conflict, such as -3.
 
-    `diverged_at_s` of the result is None where the replay is identical.
+    Returns:
+        The comparison. Its `diverged_at_s` is None if the replay is identical.
+
+    Raises:
+        UserError: the folder is neither a scenario nor a campaign, or the index has no case.
+
+    Example:
+        assert ms.replay("scenarios/stalemate").diverged_at_s is None
     """
     check_from(from_s)
     return replayer.replay(_scenario_folder(folder, index), from_s)
@@ -338,27 +418,27 @@ def replay(folder: c.AnyRun, index: int | None = None, *, from_s: float | None =
 
 @checked
 def open_in_gui(folder: c.AnyRun, index: int | None = None, *, from_s: float | None = None) -> None:
-    """Show a case in sumo-gui until the window is closed.
+    """Show a case in sumo-gui until the user closes the window.
 
     Args:
         folder: a scenario folder, or a campaign.
-        index: the case of the campaign, which is exported where it is not yet.
-        from_s: begin so long before the first conflict, as in -3.
+        index: index of the case of the campaign. It is exported first, if necessary.
+        from_s: start relative to the first conflict, such as -3.
 
     Raises:
-        UserError: sumo-gui failed, as without a display.
+        UserError: sumo-gui failed, for example without a display.
     """
     check_from(from_s)
     replayer.open_gui(_scenario_folder(folder, index), from_s)
 
 
 def _scenario_folder(folder: c.AnyRun, index: int | None) -> Path:
-    """Return the replay folder of a case, written where it does not exist yet."""
+    """Return the replay folder of a case, and write it if it does not exist."""
     path = folder_of(folder)
     if index is None:
         if (path / SETTINGS).is_file():
             raise UserError(
-                f"{path} is a campaign: say which case, as in `merge-sumo replay {quoted(path)} 0`"
+                f"{path} is a campaign: name a case, as in `merge-sumo replay {quoted(path)} 0`"
             )
         return path
     exported = path / SCENARIOS / case_name(index)
@@ -372,7 +452,17 @@ def _scenario_folder(folder: c.AnyRun, index: int | None) -> Path:
 
 @verb(c.Compare)
 def compare(config: c.Compare) -> comparison.Comparison:
-    """Compare recorded campaigns: broken and fixed cases."""
+    """Compare recorded campaigns: broken and fixed cases.
+
+    Returns:
+        The comparison of each campaign with the one before it.
+
+    Raises:
+        UserError: the campaigns cannot be compared, or an output exists.
+
+    Example:
+        print(ms.compare(["runs/design1", "runs/design2"]))
+    """
     if isinstance(config.runs, str | Path | CampaignRun):
         raise UserError("give several campaigns in a list, the oldest first")
     out, junit = _new_files(config)
@@ -382,7 +472,14 @@ def compare(config: c.Compare) -> comparison.Comparison:
 
 @verb(c.GroundTruth)
 def truth(config: c.GroundTruth) -> TruthResult:
-    """Find the ground truth of a VUT by uniform cases."""
+    """Find the ground truth of a VUT from uniform cases.
+
+    Returns:
+        The ground truth of each level.
+
+    Raises:
+        UserError: a value or a file is wrong, or a level does not allow the engine.
+    """
     settings = settings_from_config(config)
     with opened_truths(settings, config, config.engine) as study:
         return study.truths(settings, config)
@@ -390,7 +487,14 @@ def truth(config: c.GroundTruth) -> TruthResult:
 
 @verb(c.Benchmark)
 def benchmark(config: c.Benchmark) -> sampler_study.SamplerStudy:
-    """Compare samplers with each other and with the ground truth."""
+    """Compare samplers with each other and with the ground truth.
+
+    Returns:
+        The results of all samplers.
+
+    Raises:
+        UserError: a value is wrong, a sampler is unknown, or the figure exists.
+    """
     picture = path_of(config.figure)
     if picture is not None:
         check_new(picture, "`figure`", figures.KINDS)
@@ -412,7 +516,18 @@ def benchmark(config: c.Benchmark) -> sampler_study.SamplerStudy:
 
 @verb(c.Probability)
 def probability(config: c.Probability) -> estimates.ProbabilityResult:
-    """Estimate how likely the VUT of a campaign is to fail."""
+    """Estimate the failure probability of the VUT of a campaign.
+
+    Returns:
+        The estimate and its confidence interval.
+
+    Raises:
+        UserError: a value or a file is wrong, or the output exists.
+
+    Example:
+        found = ms.probability("runs/design2", cases=100_000)
+        print(found)
+    """
     before = campaign_of(config.run).recorded
     target = path_of(config.out) or before.folder / estimates.PROBABILITY.name
     total = estimates.DEFAULT_CASES if config.cases is None else config.cases
@@ -422,7 +537,14 @@ def probability(config: c.Probability) -> estimates.ProbabilityResult:
 
 @verb(c.Stress)
 def stress(config: c.Stress) -> ladder.StressResult:
-    """Run the cases of a campaign again, each time a little otherwise."""
+    """Run the cases of a campaign again, with small changes of the simulation.
+
+    Returns:
+        The failures that fail every time, and the results of each change.
+
+    Raises:
+        UserError: the VUT is code and was not given, or a value is wrong.
+    """
     before = campaign_of(config.run).recorded
     ladder.STRESS.check(before.folder)
     cases = ladder.RUNS * sum(outcome.is_tested for outcome in before.outcomes)
@@ -432,7 +554,17 @@ def stress(config: c.Stress) -> ladder.StressResult:
 
 @verb(c.Explain)
 def explain(config: c.Explain) -> explanation.ExplanationResult:
-    """Find the smallest changes with which a failure passes."""
+    """Find the smallest changes with which a failure passes.
+
+    Returns:
+        The explanation: for each coordinate and parameter the nearest value with which it passes.
+
+    Raises:
+        UserError: the case is not a failure, or the controller does not have a parameter.
+
+    Example:
+        print(ms.explain("runs/design1"))
+    """
     before = campaign_of(config.run).recorded
     explanation.EXPLANATIONS.check(before.folder)
     explanation.failure_of(before, config.case)
@@ -443,7 +575,14 @@ def explain(config: c.Explain) -> explanation.ExplanationResult:
 
 @verb(c.Reproduce)
 def reproduce(config: c.Reproduce) -> reproduction.Reproduction:
-    """Reproduce Table II and the figures of the paper."""
+    """Reproduce Table II and the figures of the paper.
+
+    Returns:
+        The table, and the path of the page with all figures.
+
+    Raises:
+        UserError: a value is wrong, or matplotlib is missing.
+    """
     scale = reproduction.scale_of(config)
     policies, folder = policies_folder(config.policies, US23), path_of(config.out)
     figures.require("matplotlib")
@@ -461,37 +600,68 @@ def reproduce(config: c.Reproduce) -> reproduction.Reproduction:
 
 @verb(c.Vuts)
 def vuts(config: c.Vuts) -> Shown:
-    """Return the VUTs that can be tested, and the kinds that a user can bring."""
+    """List the vehicles that can be tested, and the kinds that users can bring.
+
+    Returns:
+        The built-in and the installed VUTs, and the forms of all kinds.
+    """
     return vut_check.known_vuts(config.policies)
 
 
 @verb(c.CheckVut)
 def check_vut(config: c.CheckVut) -> vut_check.VutCheck:
-    """Let a VUT drive a few cases and report its faults."""
+    """Check a VUT in a few cases.
+
+    Returns:
+        The errors of the VUT and the time of a step. `ok` is true if there are no errors.
+
+    Raises:
+        UserError: the VUT or the scenario does not exist.
+
+    Example:
+        found = ms.check_vut("my_vut.py:MyVut")
+        assert found.ok, found.problems
+    """
     scenario = scenario_from(config.scenario or US23)
     settings = CampaignSettings(scenario=scenario, levels=(0,), **named_settings(config))
     with Bars() as bars:
-        bars.say(
-            f"{printable(settings.vut)} drives a few cases: minutes, where a step takes seconds"
-        )
+        bars.say(f"{printable(settings.vut)} drives a few cases, which may take minutes")
         return vut_check.check_vut(settings)
 
 
 @checked
 def scenarios() -> Shown:
-    """Return the scenarios that the package brings, by name; as `merge-sumo scenario list`."""
+    """List the shipped scenarios by name, as `merge-sumo scenario list` does.
+
+    Returns:
+        The scenarios. `to_record()` returns all their numbers.
+    """
     return own_scenario.shipped()
 
 
 @verb(c.NewScenario)
 def new_scenario(config: c.NewScenario) -> Shown:
-    """Write a scenario for a merge in a net, and a picture of the road."""
+    """Write a scenario for a merge in a net, and a picture of the road.
+
+    Returns:
+        The paths of the file and of the picture, and remarks on the road.
+
+    Raises:
+        UserError: the net has no such merge, or the file exists.
+    """
     return own_scenario.write_scenario(config)
 
 
 @verb(c.CheckScenario)
 def check_scenario(config: c.CheckScenario) -> Shown:
-    """Say whether a scenario can be hosted, and whether the learned drivers were trained on it."""
+    """Check that a scenario can run, and whether the learned drivers were trained on it.
+
+    Returns:
+        The road, and the differences between the scenario and the training.
+
+    Raises:
+        UserError: the scenario or its road is wrong.
+    """
     folder = None if config.policies is None else policies_in(config.policies)
     scenario = scenario_from(config.scenario)
     name = scenario.name if isinstance(config.scenario, Scenario) else str(config.scenario)
@@ -500,7 +670,14 @@ def check_scenario(config: c.CheckScenario) -> Shown:
 
 @verb(c.Train)
 def train(config: c.Train) -> PolicyChecks:
-    """Train the learned drivers and return what each loses in SUMO, by the name of the network."""
+    """Train the learned drivers and measure their regret in SUMO.
+
+    Returns:
+        The regret of each network, by name.
+
+    Raises:
+        UserError: a value is wrong, or an extra that training needs is not installed.
+    """
     from merge_sumo.training.helix import train_and_check
 
     scenario = None if config.scenario is None else scenario_from(config.scenario)
@@ -521,15 +698,15 @@ def opened_study(
     *,
     engine: str | None = None,
 ) -> Iterator[run_study.RunStudy]:
-    """Open a campaign for a study that runs cases of it, with a progress bar.
+    """Open a campaign for a study that runs cases of the campaign, with a progress bar.
 
     Args:
         run: the campaign.
-        config: how and where cases of it run.
-        title: of the bar.
-        total: number of cases, which may depend on the engine.
+        config: how and where the cases run.
+        title: title of the bar.
+        total: number of cases, or the numbers by engine.
         unit: name of the counted things.
-        engine: what moves the vehicles.
+        engine: engine that moves the vehicles.
     """
     settings = settings_from_folder(run.folder, run.record, named_settings(config))
     plan = settings.load_plan().with_engine(engine)
@@ -544,15 +721,15 @@ def opened_study(
 def opened_truths(
     settings: CampaignSettings, config: c.Execution, engine: str | None = None
 ) -> Iterator[sampler_study.Study]:
-    """Open a study of truths; the truths of objects of this process are not kept.
+    """Open a study of ground truths. It does not keep truths of objects of this process.
 
     Args:
         settings: the settings of the study.
         config: where its cases run.
-        engine: engine that moves the vehicles; by default the kinematic one where it is possible.
+        engine: engine that moves the vehicles; by default the kinematic one, if possible.
 
     Raises:
-        UserError: for an engine that a level does not allow.
+        UserError: a level does not allow the engine.
     """
     plan = settings.load_plan()
     for level in settings.levels:
@@ -569,7 +746,7 @@ def opened_truths(
 
 
 def path_of(path: Path | str | None) -> Path | None:
-    """Return a path of a user as one of `pathlib`.
+    """Return a path of a user as a `Path`.
 
     Args:
         path: the path; None stands for no path.
@@ -585,15 +762,15 @@ def run_and_report(
     *,
     resumes: bool = False,
 ) -> CampaignRun:
-    """Run a campaign to its end: cases, counterfactuals, report, JUnit file; return it.
+    """Run a campaign to its end and return it: cases, counterfactuals, report and JUnit file.
 
-    An interruption has a note on how to continue.
+    The exception of an interruption has a note that says how to continue.
 
     Args:
         settings: the settings of the campaign.
         plan: how its cases run.
-        folder: a new folder, or that of the campaign.
-        config: gates, JUnit file, workers, and functions that are called.
+        folder: a new folder, or the folder of the campaign.
+        config: gates, JUnit file, workers, and functions to call.
         resumes: whether the campaign continues in the folder.
     """
     junit = path_of(config.junit)

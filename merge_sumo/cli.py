@@ -82,7 +82,8 @@ FIELDS: Mapping[str, Parameter] = {
 }
 """Other settings of an option, by the name of its field."""
 SEARCH, LOOK, CHANGE, OWN, RESEARCH = map(
-    Group.create_ordered, ("Search", "Look", "Change", "Bring your own", "Research")
+    Group.create_ordered,
+    ("Find failures", "Inspect cases", "Compare versions", "Bring your own", "Research"),
 )
 GONE: Mapping[str, str] = {
     "board": "`merge-sumo report` prints on A4, and `report --json` lists each fact and its source",

@@ -28,8 +28,8 @@ NOTEBOOKS = "tutorials/*.ipynb"
 
 COMMANDS: Final = """# Commands
 
-This page lists all commands and all their options. `merge-sumo COMMAND --help` shows a short form
-of it.
+This page lists all commands and all their options. `merge-sumo COMMAND --help` prints a
+shorter text.
 
 """
 EXIT_CODES: Final = """

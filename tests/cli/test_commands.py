@@ -19,9 +19,9 @@ from merge_sumo.errors import UserError
 
 COMMANDS = commands()
 PANELS = {
-    "Search": {"campaign", "probability", "run"},
-    "Look": {"explain", "export", "replay", "report"},
-    "Change": {"compare", "rerun"},
+    "Find failures": {"campaign", "probability", "run"},
+    "Inspect cases": {"explain", "export", "replay", "report"},
+    "Compare versions": {"compare", "rerun"},
     "Bring your own": {"check-vut", "scenario", "train", "vuts"},
     "Research": {"benchmark", "reproduce", "truth"},
 }
