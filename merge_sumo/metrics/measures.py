@@ -315,7 +315,7 @@ class Measures:
         """
         return float(gaps_at_m(self.trajectory)[0].min(initial=math.inf))
 
-    @measure(worse="low", label="smallest gap from M on, or overlap", column="clearance")
+    @measure(worse="low", label="smallest gap from M on, or overlap (negative)", column="clearance")
     def clearance_m(self) -> float | None:
         """Smallest gap between bumpers from M on, or the overlap of bodies if that is less.
 
@@ -390,7 +390,7 @@ class Measures:
         """Largest mean braking of the POV over 1.6 s up to t1, or over a shorter episode."""
         return sustained_brake_mps2(self.trajectory.motion[:, self.trajectory.nearest, 1])
 
-    @measure(worse="high", label="slow-down of the POV up to M", column="POV slows by")
+    @measure(worse="high", label="loss of speed of the POV up to M", column="POV slows by")
     def pov_slowdown_mps(self) -> float | None:
         """Largest loss of speed of the POV up to t1, compared with its highest speed before."""
         v_mps = self.trajectory.motion[:, self.trajectory.nearest, 1]

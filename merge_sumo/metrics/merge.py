@@ -117,7 +117,7 @@ def meanings(scenario: Scenario) -> dict[Severity, str]:
         Severity.CONTACT: f"bodies overlap before M or {soon} it",
         Severity.CONFLICT: f"front bumpers within {scenario.dx_crash_m:g} m at M, no contact",
         Severity.HARSH: f"a car behind brakes harder than {HARSH_MPS2:g} m/s² {soon} M",
-        Severity.SAFE: "none of these",
+        Severity.SAFE: "none of the other classes",
     }
     if not scenario.follow_up_s:
         del found[Severity.HARSH]

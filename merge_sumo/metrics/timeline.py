@@ -1,8 +1,8 @@
 """The timeline of a case: its events in the order of time, and the kind of a failure.
 
-Terminal, report, player and JUnit files show what `timeline` returns. A vehicle brakes in a phase
-in which its speed falls by 1 m/s or more without a pause of a second, and accelerates in one in
-which it rises so. A speed pauses where it changes by less than 0.1 m/s2.
+Terminal, report, player and JUnit files show the result of `timeline`. A vehicle brakes in a phase
+in which its speed falls by 1 m/s or more without a pause of a second. It accelerates in a phase in
+which its speed rises by 1 m/s or more. A speed pauses while it changes by less than 0.1 m/s2.
 """
 
 from __future__ import annotations
@@ -31,18 +31,18 @@ KIND_STEPS = 30
 """Steps before the last event in which the conduct of both vehicles gives the kind."""
 KINDS = {
     "did not arrive": "the VUT does not merge in time",
-    "rule broken": "the rule is one of the user, and none of contact, distance or braking after M",
-    "cut in": "the VUT keeps the limit at M, and a car behind it then touches it or has to brake",
-    "late brake": "the VUT brakes, and began when no way out was left",
-    "both brake": "both brake, and the VUT began while a way out was left",
-    "weak brake": "only the VUT brakes, and began while a way out was left",
+    "rule broken": "your own rule is broken, not a limit of contact, distance or braking after M",
+    "cut in": "the VUT keeps the limit at M, then a car behind it touches it or must brake hard",
+    "late brake": "the VUT brakes, but begins when no way out is left",
+    "both brake": "both brake, and the VUT begins while a way out is left",
+    "weak brake": "only the VUT brakes, and begins while a way out is left",
     "both accelerate": "both accelerate",
-    "squeeze": "the VUT does not brake, and one car at most accelerates",
+    "squeeze": "the VUT does not brake, and at most one car accelerates",
 }
-"""Rules of the kinds of failures; the first rule that holds names a failure. A vehicle brakes here
-if, in the 3 s before the last event, its speed last differed by 1 m/s when it was higher than at
-that event, and accelerates if it was lower. A way out is full braking or full acceleration that
-keeps the scenario's limit at M."""
+"""Rules of the kinds of failures; a failure has the first kind whose rule fits. To classify a
+vehicle, find the last time in the 3 s before the last event at which its speed differed by 1 m/s
+from its speed at that event. The vehicle brakes if it was faster then, and accelerates if it was
+slower. A way out is full braking or full acceleration that keeps the scenario's limit at M."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +51,7 @@ class Event:
 
     Attributes:
         time_s: its time; of a phase, its begin.
-        text: what happens, in a clause.
+        text: the event, in a clause.
         car: the vehicle that brakes or accelerates, or that the VUT meets; else None.
     """
 
@@ -76,7 +76,7 @@ class Timeline:
 
     @property
     def in_a_line(self) -> str:
-        """Result and last event, where one line is shown; what both have is said once."""
+        """Result and last event on one line; a contact in both appears once."""
         last = self.events[-1].text
         _, contact, impact = self.result.partition("contact ")
         if contact and last.endswith(impact):
@@ -177,7 +177,7 @@ def _phases(outcome: Outcome, motion: FloatArray, met: set[Vehicle | None]) -> I
 
 
 def _way_out(outcome: Outcome) -> Iterator[Event]:
-    """Yield until when the VUT could keep its distance at M."""
+    """Yield the last time at which the VUT could keep its distance at M."""
     found, scenario = outcome.measures, outcome.case.scenario
     text = "last way out: full braking or full acceleration"
     if found.last_avoidable_s is None:
@@ -198,7 +198,7 @@ def _rule(outcome: Outcome) -> str | None:
 def _ends(
     outcome: Outcome, trajectory: Trajectory | None, met: Encounter, rule: str | None
 ) -> Iterator[Event]:
-    """Yield merge, contact and what follows; by the last one in time a failure breaks the rule."""
+    """Yield merge, contact and later events; the last one in time breaks the rule of a failure."""
     found, scenario, contact_s = outcome.measures, outcome.case.scenario, None
     text, car = message_of(outcome), found.nearest
     if found.end is End.MERGED:
@@ -228,9 +228,7 @@ def _ends(
         a_mps2 = trajectory.whole[len(trajectory.motion) - 1 :, :, 2]
         row, index = divmod(int(np.abs(a_mps2 + hardest_mps2).argmin()), len(a_mps2[0]))
         row += len(trajectory.motion) - 1
-        text = (
-            f"the {NAMES[VEHICLES[index]]} brakes hardest of those behind: -{hardest_mps2:.1f} m/s2"
-        )
+        text = f"the {NAMES[VEHICLES[index]]} brakes hardest: -{hardest_mps2:.1f} m/s2"
         text += f", down to {trajectory.whole[row:, index, 1].min():.1f} m/s"
         yield Event(_time_s(row), text, VEHICLES[index])
     last_s = _time_s(len(trajectory.whole) - 1)
@@ -246,8 +244,8 @@ def _must_brake(trajectory: Trajectory) -> str:
     at_m, car = trajectory.motion[-1], needed_mps2.argmax()
     name = NAMES[VEHICLES[car if at_m[car, 0] < at_m[VUT, 0] else VUT]]
     if np.isinf(needed_mps2[car]):
-        return f"the {name} is too near to brake"
-    return f"the {name} has to brake at -{needed_mps2[car]:.1f} m/s2"
+        return f"the {name} is too close to brake in time"
+    return f"the {name} must brake at -{needed_mps2[car]:.1f} m/s2"
 
 
 def _kind(

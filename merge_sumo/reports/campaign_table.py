@@ -1,4 +1,4 @@
-"""The end of a campaign in a terminal: a line on all, a table of POV levels, and what follows."""
+"""The end of a campaign in a terminal: a summary line, a table of POV levels, and remarks."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ COLUMNS = (
 
 
 def campaign_lines(run: RecordedCampaign, summary: Summary, facts: Sequence[Fact]) -> list[str]:
-    """Return the first line, the table, and the remarks on a campaign.
+    """Return the summary line, the table, and the remarks of a campaign.
 
     Args:
         run: the campaign.
@@ -87,11 +87,11 @@ def labelled(label: str, lines: Iterable[str]) -> Iterator[str]:
 
 
 def level_table(summary: Summary, shares: Mapping[int | None, str]) -> list[list[str]]:
-    """Return the table of POV levels: a head, and a row for each level; no empty column.
+    """Return the table of POV levels without empty columns: a head, and a row for each level.
 
     Args:
         summary: summary of the campaign.
-        shares: share of all starts that fail, as text, of the levels of which it is known.
+        shares: share of all starts that fail, as text, by level; unknown shares are missing.
     """
     rows = [list(COLUMNS)]
     for level, of in summary.levels.items():
@@ -108,14 +108,14 @@ def level_table(summary: Summary, shares: Mapping[int | None, str]) -> list[list
 def _remarks(
     run: RecordedCampaign, summary: Summary, of: Mapping[str, Fact], has_shares: bool
 ) -> Iterator[tuple[str, list[str]]]:
-    """Yield labels, and the lines behind each."""
+    """Yield labels, each with its lines."""
     yield "Not judged:", [line.strip() for line in summary.error_lines()]
     if CONTACT in of:
         cases = _counted(of[CONTACT], "case")
         yield "Not counted:", [f"{cases} with contact (`fail_when` unsafe counts them)"]
     if not has_shares and PROBABILITY_TO_FAIL not in of:
         measure = campaign_command("probability", run.folder, run.record)
-        yield "Not known:", ["the share of all starts that fail, which is measured by", measure]
+        yield "Not known:", ["the share of all starts that fail; to measure it, run", measure]
     if AT_MOST in of:
         yield "Converged:", [f"before {of[AT_MOST].shown} cases, as little new was found"]
     if AVOIDED_BY_POV in of:
@@ -130,7 +130,7 @@ def _counted(fact: Fact, thing: str) -> str:
 
 
 def _avoidable(of: Mapping[str, Fact]) -> str:
-    """Return how many failures the reference drivers, and a careful POV, would have avoided."""
+    """Return how many failures the reference drivers and a careful POV avoid."""
     driven = of[DRIVEN if DRIVEN in of else FAILURES]
     drivers: defaultdict[float | str, list[str]] = defaultdict(list)
     for name in REFERENCE_DRIVERS:
@@ -140,7 +140,7 @@ def _avoidable(of: Mapping[str, Fact]) -> str:
         parts.append(f"{_times(number, driven)} by {', '.join(drivers[number])}")
     parts.append(f"{_times(of[AVOIDED_BY_POV].value, driven)} by a careful POV")
     text = "; ".join(parts)
-    return f"of {driven.shown} that were driven again: {text}" if DRIVEN in of else text
+    return f"of the {driven.shown} worst: {text}" if DRIVEN in of else text
 
 
 def _times(number: float | str, whole: Fact) -> str:

@@ -40,9 +40,9 @@ from merge_sumo.scenario.trajectory import End
 MOST = 40
 """Maximum number of cases of a file where the user names none."""
 ABOUT = """\
-# `merge-sumo rerun THIS-FILE --vut SPEC` exits with 1 where a case passes no more, ends in a new
-# error, or passes with a new contact; with `tolerance = 0.2` above the cases also where a margin
-# drops by more than 0.2. A known failure may have in its line: accepted = "the reason"
+# `merge-sumo rerun THIS-FILE --vut SPEC` exits with 1 if a case no longer passes, ends in a new
+# error, or passes with a new contact. With `tolerance = 0.2` above the cases, it also exits with 1
+# if a margin drops by more than 0.2. To accept a known failure, add to its line: accepted = "WHY"
 """
 
 
@@ -69,7 +69,7 @@ def with_file(compared: Comparison, file: CasesFile, path: Path) -> Comparison:
         elif one.change is Change.WEAKER:
             notes.append(f"case {index}, {one.change}: {change_in_words(one)}")
         elif reason:
-            result = "passes now: take the mark away" if one.later.passes else "fails, not counted"
+            result = "passes now: remove the mark" if one.later.passes else "fails, not counted"
             notes.append(f"case {index} is accepted ({reason}) and {result}")
     for old, new in zip(before.splitlines(), text.splitlines(), strict=True):
         if old != new:
@@ -81,10 +81,11 @@ def with_file(compared: Comparison, file: CasesFile, path: Path) -> Comparison:
 
 
 def watching(run: RecordedCampaign) -> list[Outcome]:
-    """Return at most 40 outcomes of a campaign, those that detect changes of a controller.
+    """Return at most 40 outcomes of a campaign that detect changes of a controller.
 
-    A quarter are the worst failures of regions. The others pass, if enough cases do: of each level
-    in turn the one of least margin that is a radius from those chosen before, then the farthest.
+    A quarter are the worst failures of regions. The others pass, if enough cases pass. They are
+    chosen from the levels in turn: first the case of least margin that is at least a radius from
+    the chosen cases, then the case that is farthest from them.
 
     Args:
         run: the campaign; all of its outcomes if there are not more.
@@ -149,8 +150,8 @@ def write_cases(run: RecordedCampaign, indices: Sequence[int], target: Path) -> 
     write_new(path, cases_toml(run, outcomes, path, run.settings.vut).encode())
     if not indices and len(outcomes) < len(run.outcomes):
         notice(
-            f"the file has {len(outcomes)} of {len(run.outcomes):,} cases, chosen to "
-            "watch a controller; name others by their index"
+            f"the file has {len(outcomes)} of {len(run.outcomes):,} cases, chosen to detect "
+            "changes of a controller; name other cases by their index"
         )
     return path
 
@@ -183,7 +184,7 @@ def cases_toml(run: RecordedCampaign, outcomes: Iterable[Outcome], path: Path, v
 
 
 def _scenario(scenario: Scenario, path: Path) -> dict[str, Any]:
-    """Return the name of a scenario, and its values that are not those by default."""
+    """Return the name of a scenario, and its values that differ from the defaults."""
     record = scenario.to_record()
     if len(Path(scenario.net or "").parts) > 1:
         record["net"] = f"./{Path(os.path.relpath(str(scenario.net), path.parent)).as_posix()}"

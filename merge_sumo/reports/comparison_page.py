@@ -1,4 +1,4 @@
-"""The page of a comparison: failures, changes, and a list of cases beside one player, in a file."""
+"""The page of a comparison in one file: failures, changes, and a list of cases with a player."""
 
 from __future__ import annotations
 

@@ -33,16 +33,16 @@ PERCENT = "%"
 
 # Names of facts that the terminal and the templates look up.
 VUT = "VUT"
-RULE = "a case fails with"
+RULE = "failure criterion"
 CASES = "cases"
-AT_MOST = "cases at most; the search converged before"
+AT_MOST = "maximum number of cases; the search converged earlier"
 ERRORS = "errors"
 TIMEOUTS = "timeouts"
 FAILURES = "failures"
 UNDECIDED = "undecided"
 CONTACT = "cases with contact that are not failures"
 STARTS_THAT_FAIL = "starts that fail"
-DRIVEN = "failures that reference drivers drove"
+DRIVEN = "failures that ran again with reference drivers"
 AVOIDED = "failures that driver {} avoids"
 AVOIDED_BY_POV = "failures that a careful POV avoids"
 PROBABILITY_TO_FAIL = "probability that a case fails"
@@ -92,7 +92,7 @@ Facts = Iterator[Fact]
 
 
 def facts_of(run: RecordedCampaign, summary: Summary) -> list[Fact]:
-    """Return the facts of a campaign and of the studies in its folder.
+    """Return the facts of a campaign and of the studies in its run folder.
 
     Args:
         run: the campaign.
@@ -175,9 +175,9 @@ def _of_level(run: RecordedCampaign, level: int, summary: LevelSummary, failing:
         return
     at_level = [outcome for outcome in run.cases if outcome.case.level == level]
     forced = sum(share >= 1.0 for share in _values(at_level, "lane_share"))
-    yield fact("merges where the lane ends", forced, "lane_share >= 1")
+    yield fact("merges at the end of the lane", forced, "lane_share >= 1")
     stood = sum(time_s > 0.0 for time_s in _values(at_level, "stood_s"))
-    yield fact("cases that stood on the lane", stood, "stood_s > 0")
+    yield fact("cases in which the VUT stood on the lane", stood, "stood_s > 0")
     for name, key, unit, scale in (
         ("place of the merge, median", "lane_share", "% of the lane", 100.0),
         ("time gap ahead, median", "time_gap_ahead_s", "s", 1.0),
@@ -204,15 +204,15 @@ def _repeats(run: RecordedCampaign) -> Facts:
         yield Fact("runs", sum(case.runs for case in cases), "draw")
         yield Fact("cases that ran more than once", len(repeated), "draw")
         both = sum(0 < case.failures < case.runs for case in repeated)
-        yield Fact("of these, cases that both fail and pass", both, "draw")
+        yield Fact("of these, cases with failing and passing runs", both, "draw")
     if run.tolerated:
-        name = "share of its runs in which a case may fail"
+        name = "tolerated share of failing runs of a case"
         yield Fact(name, 100.0 * run.tolerated, "tolerated", PERCENT, SETTINGS)
 
 
 def _motion(run: RecordedCampaign, undecided: frozenset[int], failing: str) -> Facts:
     simulated_s = sum(outcome.measures.t_end_s for outcome in run.outcomes)
-    yield Fact("simulated time up to M", simulated_s / 3600.0, "t_end_s", "h")
+    yield Fact("simulated time up to the merge", simulated_s / 3600.0, "t_end_s", "h")
     failed = failures(run.cases)
     if not failed:
         return
@@ -242,7 +242,7 @@ def _avoided(run: RecordedCampaign, undecided: frozenset[int]) -> Facts:
 def _studies(run: RecordedCampaign) -> Facts:
     stress = STRESS.read(run.folder)
     if stress is not None and stress.failures:
-        name = f"failures that stay failures in all {stress.runs} runs of the stress test"
+        name = f"failures that fail in all {stress.runs} runs of the stress test"
         yield Fact(name, len(stress.robust), "rungs", file=STRESS.name)
     known = PROBABILITY.read(run.folder)
     if known is not None and known.overall is not None and known.is_judged:

@@ -1,7 +1,7 @@
 """Figures of experiments, drawn by matplotlib (the extra `plot`), and the page of a reproduction.
 
-Each sampler and each POV level has one colour in all figures, which any kind of colour vision tells
-apart (Okabe and Ito, 2008).
+Each sampler and each POV level has one colour in all figures, from a palette for all kinds of
+colour vision (Okabe and Ito, 2008).
 """
 
 from __future__ import annotations
@@ -160,7 +160,7 @@ def coverage_curves(title: str, study: SamplerStudy) -> Figure:
         axes.axhline(study.truth_fmc, color="black", lw=1.2, label=TRUTH)
         axes.axhline(study.limit_fmc, color="black", lw=1.2, ls=":", label="limit")
         axes.set_ylim(0.0)
-        axes.set_xlabel("cases")
+        axes.set_xlabel("number of cases")
         axes.set_ylabel("failure mode coverage (FMC)")
         axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
     return figure
@@ -191,7 +191,7 @@ def maps(title: str, panels: Mapping[str, Panel], level: int) -> Figure:
             axes.scatter(failing[:, 0], failing[:, 1], s=size, color=ink, **dots)
             _pool_axes(axes, US23.dimensions(level))
             axes.label_outer()
-            found = f"{len(failing)} of {len(panel.points)} fail, FMC {panel.fmc:.4f}"
+            found = f"{len(failing)} of {len(panel.points)} cases fail, FMC {panel.fmc:.4f}"
             axes.set_title(name, color=ink, fontweight="bold")
             axes.set_title(found, loc="right", fontsize=8.5)
     return figure
@@ -259,11 +259,11 @@ def predicted_margins(
             learned = _physical(predicted.learned, level)
             marks = {"s": 9, "color": "white", "edgecolors": "black", "linewidths": 0.5}
             axes.scatter(*learned.T, **marks)
-            axes.set_title(f"after batch {batch}: {len(learned)} cases")
+            axes.set_title(f"after batch {batch} ({len(learned)} cases)")
             _pool_axes(axes, US23.dimensions(level))
             axes.label_outer()
         bar = figure.colorbar(filled, ax=figure.axes, shrink=0.85, ticks=steps[::5])
-        bar.set_label("predicted margin (white line: 0, below which a case fails)")
+        bar.set_label("predicted margin (below 0, the white line, a case fails)")
     return figure
 
 
@@ -284,8 +284,8 @@ def allocation(title: str, by_sampler: Mapping[str, LevelBatches]) -> Figure:
             below.set_xlabel("batch")
             below.locator_params(axis="x", integer=True)
         grid[0, 0].set_ylim(0)
-        grid[0, 0].set_ylabel("cases of the batch")
-        grid[1, 0].set_ylabel("mean margin of the batch")
+        grid[0, 0].set_ylabel("number of cases in the batch")
+        grid[1, 0].set_ylabel("mean margin in the batch")
         grid[0, 0].legend(loc="upper left", title="POV level", ncols=3)
     return figure
 
@@ -305,7 +305,7 @@ def _band(axes: Axes, values: FloatArray, level: int) -> None:
 
 
 def _axes(axes: Axes | None) -> Axes:
-    """Return given axes, or those of a new figure that a notebook shows."""
+    """Return the given axes, or the axes of a new figure that a notebook shows."""
     if axes is None:
         _, axes = require("matplotlib.pyplot").subplots(figsize=(8, 5), layout="constrained")
     return axes

@@ -49,8 +49,8 @@ def write_junit(path: Path, result: CampaignRun) -> None:
     """Write the JUnit file of a campaign.
 
     It has a suite of gates, a suite of the cases that an earlier version also ran, and a suite of
-    each POV level. A failure or a timeout is a `failure`, whose type is the severity; an error of
-    the VUT or of the simulation is an `error`; an undecided case is `skipped`.
+    each POV level. A failing case or a timeout is a `failure`, and its type is the severity. An
+    error of the VUT or of the simulation is an `error`. An undecided case is `skipped`.
 
     Args:
         path: new file to write.
@@ -121,7 +121,7 @@ def _cases(run: RecordedCampaign, undecided: frozenset[int]) -> list[TestCase]:
             test.tag, test.message = "skipped", f"undecided: {told[index].in_a_line}"
         elif index in told:
             test.tag = "error" if measures.end.is_error else "failure"
-            # A criterion may call a case a failure in which the VUT never reached M.
+            # Under some criteria a case fails without reaching M.
             test.kind = (measures.severity or "failed") if outcome.is_tested else measures.end
             test.message = told[index].in_a_line
         tests.append(test)

@@ -22,7 +22,7 @@ X_AXIS = "x, m (0 at M, negative before it)"
 """Label of positions over time in all charts."""
 TEMPLATES = Path(__file__).parent / "templates"
 ERROR_CHARACTERS = 2000
-"""Longest message or setting in a page; the files of the run folder have the whole."""
+"""Longest message or setting in a page; the files of the run folder have the whole text."""
 
 
 def page(

@@ -38,7 +38,7 @@ class _Bar:
     Attributes:
         start_s: time of its first update.
         before: count at its first update.
-        shown_s: time at which it was last shown; at first long ago.
+        shown_s: time at which it was last shown; minus infinity before that.
         shown: count that was last shown.
         task: task of rich; None while nothing is drawn.
     """
@@ -53,7 +53,7 @@ class _Bar:
 class Bars:
     """Progress bars by title; a bar appears with its first update.
 
-    Without a terminal, a line is printed at the begin, every minute, and at the end.
+    Without a terminal, they print a line at the begin, every minute, and at the end.
 
     Example:
         >>> with Bars() as bars:
@@ -146,7 +146,7 @@ class Bars:
         return self
 
     def __exit__(self, _kind: object, error: BaseException | None, _trace: object) -> None:
-        """Leave the bars as they are; remove them where the work was stopped."""
+        """Keep the bars; remove them if an error stopped the work."""
         # Ctrl-C may come between the start of the drawing and the first bar.
         if self._progress.live.is_started:
             self._progress.live.transient = error is not None

@@ -2,8 +2,8 @@
 
 `write_report` writes it; `RunningReport` rewrites it while a campaign runs.
 
-Names and messages may be hostile: the template escapes them, the JSON has no "<", the script sets
-text and no markup, and the policy of the page allows that script alone and loads nothing.
+Names and messages may be hostile: the template escapes them, the JSON has no "<", and the script
+sets text and no markup. The policy of the page allows only this script and loads nothing.
 """
 
 from __future__ import annotations
@@ -142,7 +142,7 @@ class RunningReport:
         self._is_there = False
 
     def rewrite(self, _: Sequence[Outcome] = ()) -> None:
-        """Write the report if its time has come.
+        """Write the report if it is due.
 
         Args:
             _: outcomes that a campaign passes to its callbacks; the report reads the folder.
@@ -154,7 +154,7 @@ class RunningReport:
         took_s = time.monotonic() - start_s
         self._due_s = start_s + max(REPORT_EVERY_S, took_s / REPORTS_SHARE)
         if not self._is_there:
-            self._due_s = math.inf  # no second try: the last report gives the reason
+            self._due_s = math.inf  # no second attempt: the last report gives the reason
 
     def __enter__(self) -> Self:
         return self

@@ -32,7 +32,7 @@ from merge_sumo.scenario.signals import to_runs
 from merge_sumo.scenario.trajectory import Trajectory
 
 SPEED_UNIT_MPS = 0.002
-"""Speeds are whole numbers of this in 16 bits: up to 131 m/s, positions within 2 cm."""
+"""Unit of speeds, which are whole numbers in 16 bits: up to 131 m/s, positions within 2 cm."""
 COUNT_GRID = (32, 20)
 """Cells of a map, across and up, in which further cases are counted."""
 GRID: dict[int, Grid] = {2: (49, 49, 1), 3: (33, 33, 9)}

@@ -21,7 +21,7 @@ from merge_sumo.scenario.scenario import LEVELS
 LISTED = 10
 """Cases in a list, and messages of errors and timeouts."""
 SHOWN = 2000
-"""Cases that the page holds one by one, with their motion; more are shown as counts."""
+"""Cases that the page shows one by one, with their motion; further cases are counts."""
 
 
 class ReportModel:
@@ -38,16 +38,16 @@ class ReportModel:
         surfaces: surrogate of each level; None without one.
         coordinates: coordinates of all levels.
         axes: coordinates of each level, in the pool's order.
-        shares: the uniform cases of each level of which some have a verdict.
+        shares: the share of starts that fail, of each level where some uniform case has a verdict.
         stress: result of the stress test; None without one.
         avoidance: drivers that avoid a failure, by its index.
         explanations: explanations of failures.
         against: comparison with an earlier version; None without one.
         worst: failures, the worst first.
         spread: the listed failures: the worst of each region first.
-        nearest: the listed cases that do not fail, those nearest to a failure.
-        error_groups: messages of errors and timeouts, with the listed cases of each.
-        shown: cases that the page holds one by one, in their order.
+        nearest: the listed cases that pass, with the lowest margins.
+        error_groups: messages of errors and timeouts, each with its listed cases.
+        shown: cases that the page shows one by one, in their order.
         regions: region of each failure, by its index.
         motion: trajectories of the shown cases by index; lost ones are missing.
         timelines: timelines of the shown cases by index.
@@ -96,7 +96,7 @@ class ReportModel:
             self.described += failure_regions(run.cases, level, self.regions)
 
     def _choose_cases(self) -> None:
-        """Choose the cases that are listed, and those that the page holds one by one."""
+        """Choose the cases for the lists, and the cases that the page shows one by one."""
         self.worst = failures(self.run.cases)
         self.regions = regions_of(self.worst)
         self.spread = spread_failures(self.worst)
@@ -105,7 +105,7 @@ class ReportModel:
             self.spread.sort(key=lambda outcome: outcome.index not in robust)
         self.spread = self.spread[:LISTED]
         others = [outcome for outcome in self.run.cases if not outcome.failed]
-        # Those without a verdict, then those nearest to a failure.
+        # Cases without a verdict, then the cases nearest to a failure.
         others.sort(key=lambda one: (one.passes, one.margin or 0.0, one.index))
         passing = [one for one in others if one.passes and one.margin is not None]
         self.nearest = passing[:LISTED]

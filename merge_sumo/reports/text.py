@@ -152,7 +152,7 @@ def comparison_lines(compared: Comparison) -> list[str]:
 def _too_small(truth: Truth) -> str:
     """Return that a truth has too few cases, in a clause."""
     return (
-        "too small for shares and regions: the same number of cases again could add up to "
+        "too small for shares and regions: doubling the number of its cases could add up to "
         f"{truth.growth:.0%} to its FMC"
     )
 
@@ -176,11 +176,11 @@ def truth_lines(found: TruthResult) -> list[str]:
             line += f", {regions} with at least {REAL_REGION:.0%} of the failures"
         if truth.in_sumo < len(truth.margin):
             cases = counted(truth.in_sumo, "case")
-            line += f"; by the equations of motion, and {cases} in SUMO as well, all alike"
+            line += f"; by the equations of motion; {cases} ran in SUMO too, with equal results"
         lines.append(line)
         if truth.is_small:
             lines.append(f"  {_too_small(truth)}")
-    return [*lines, f"  a case fails with {found.criterion.description(found.scenario)}"]
+    return [*lines, f"  failure criterion: {found.criterion.description(found.scenario)}"]
 
 
 def _spread(spread: Spread, form: str) -> str:
@@ -208,9 +208,9 @@ def sampler_lines(study: SamplerStudy) -> list[str]:
     for level, truth in study.truths.items():
         if truth.is_small:
             lines.append(f"  at level {level_name(level)} it is {_too_small(truth)}")
-    line = f"limit: FMC {study.limit_fmc:.4f}, of all failures of truth and searches"
+    line = f"limit: FMC {study.limit_fmc:.4f}, of all failures in the truth and the searches"
     if study.dense:
-        line += f", or of {DENSE_CASES:,} uniform cases, where that is more"
+        line += f", or in {DENSE_CASES:,} uniform cases if that is more"
     lines.append(line)
 
     head = ["sampler", "FMC / truth", "FMC / limit", "covered share", "FMC", "failures", "regions"]
@@ -229,7 +229,7 @@ def sampler_lines(study: SamplerStudy) -> list[str]:
         rows.append(row)
     lines += [*aligned(rows), "medians [quartiles]"]
     if probes := sum(map(len, study.probes.values())):
-        lines.append(f"covered share: of {counted(probes, 'failing uniform case')}")
+        lines.append(f"covered share: the share of {counted(probes, 'failing uniform case')}")
     return lines if study.figure is None else [*lines, f"figure: {study.figure}"]
 
 
@@ -250,7 +250,7 @@ def reproduction_lines(found: Reproduction) -> list[str]:
         truth = one.study.truths[one.column.level]
         if truth.is_small:
             rows += ["", f"The truth of {title} is {_too_small(truth)}."]
-    return rows if found.page is None else [*rows, f"all of it: {found.page}"]
+    return rows if found.page is None else [*rows, f"all results: {found.page}"]
 
 
 def table_ii(found: Reproduction) -> Iterator[tuple[str, list[str]]]:
@@ -276,7 +276,7 @@ def table_ii(found: Reproduction) -> Iterator[tuple[str, list[str]]]:
 
 
 def _fmc_of(study: SamplerStudy) -> dict[str, float | None]:
-    """Return the values of a column of Table II by row; None for what is not known."""
+    """Return the values of a column of Table II by row; None for unknown values."""
     values: dict[str, float | None] = {"truth": study.truth_fmc}
     for name in PAPER_SAMPLERS:
         values[name] = study.samplers[name].fmc.median
@@ -310,7 +310,7 @@ def probability_lines(found: ProbabilityResult) -> list[str]:
         found: the probability.
     """
     if not found.is_judged:
-        return ["P(fail) is not known: no case was judged, the VUT never reached the merge point"]
+        return ["P(fail) is unknown: no case was judged, the VUT never reached the merge point"]
     at = f"{100.0 * found.confidence:g} % interval"
     lines = [] if found.per_merge is None else _per_merge(found.per_merge, at)
     if found.overall is not None:
@@ -327,10 +327,10 @@ def probability_lines(found: ProbabilityResult) -> list[str]:
     if found.without_verdict:
         lines.append(
             f"  {found.without_verdict} not judged (error or timeout): safe for lower ends, "
-            "failures for upper"
+            "failures for upper ends"
         )
     if found.in_sumo < found.cases:
-        lines.append(f"  by the equations of motion; {found.in_sumo:,} in SUMO too, all alike")
+        lines.append(f"  by equations of motion; {found.in_sumo:,} in SUMO too, with equal results")
     return lines
 
 
@@ -343,16 +343,16 @@ def _per_merge(one: PerMerge, at: str) -> list[str]:
     most = "" if one.most == one.least else f" to {one.most:.3g}"
     return [
         f"failures per merge: {one.least:.3g}{most} [{one.low:.3g}, {one.high:.3g}], "
-        f"{at}, whatever the shares of the POV levels",
+        f"{at}, for all shares of the POV levels",
         f"  traffic {traffic.name}: {traffic.density_veh_per_km:g} veh/km ({traffic.source})",
-        f"  counted: {one.cars:.2g} cars per merge, those that start in the pool, "
+        f"  counted: {one.cars:.2g} cars per merge that start in the pool, "
         f"{one.counted_speeds:.0%} of the speeds of this traffic",
     ]
 
 
 @lines_of.register
 def stress_lines(found: StressResult) -> list[str]:
-    """Return a table of the rungs, and the robust failures.
+    """Return a table of the changes, and the robust failures.
 
     Args:
         found: the stress test.
@@ -361,7 +361,7 @@ def stress_lines(found: StressResult) -> list[str]:
         f"{counted(found.cases, 'case')} of {found.vut}, {len(found.failures)} of them "
         f"failures, {found.runs} times each",
         # The columns of the rows below: 8, 10, 10 and 12 characters wide.
-        "   flips  now pass  now fail  no verdict  what is changed",
+        "   flips  now pass  now fail  no verdict  change",
     ]
     for rung in found.rungs:
         if rung.skipped:
@@ -369,7 +369,7 @@ def stress_lines(found: StressResult) -> list[str]:
             continue
         passing, failing, unjudged = rung.counts
         numbers = f"{found.share(rung):8.1%}{passing:10d}{failing:10d}{unjudged:12d}"
-        drawn = f", {len(rung.runs)} draws" if len(rung.runs) > 1 else ""
+        drawn = f", {len(rung.runs)} random draws" if len(rung.runs) > 1 else ""
         lines.append(f"{numbers}  {rung.about}{drawn}")
     return [*lines, robustness(found)]
 
@@ -381,14 +381,14 @@ def robustness(found: StressResult) -> str:
         found: the stress test.
     """
     if not found.failures:
-        return "no case failed: which passes fail on a rung is in the table"
+        return "no case failed; the table shows how many passing cases fail after a change"
     failures = counted(len(found.failures), "failure")
-    return f"robust, as they fail on every rung: {len(found.robust)} of {failures}"
+    return f"robust, because they fail with every change: {len(found.robust)} of {failures}"
 
 
 @lines_of.register
 def explanation_lines(result: ExplanationResult) -> list[str]:
-    """Return the failure, its timeline, and its changes.
+    """Return the failure, its timeline, and the changes that make it pass.
 
     Args:
         result: the explanation.
@@ -398,14 +398,14 @@ def explanation_lines(result: ExplanationResult) -> list[str]:
     told = timelines(run, [outcome])[outcome.index]
     lines = told.lines(outcome.case, f"case {outcome.index}")
     if found.vut is not None:
-        lines.append(f"  so far {printable(run.settings.vut)}; with {printable(found.vut)}:")
+        lines.append(f"  before: {printable(run.settings.vut)}; with {printable(found.vut)}:")
     for sentence in changes(found, outcome.case):
         lines.append(f"  {sentence}")
     return [*lines, f"in the report: {command('report', run.folder)}"]
 
 
 def changes(found: Explanation, case: Case) -> Iterator[str]:
-    """Yield the changes with which a failure passes: along axes, and at other levels.
+    """Yield the changes that make a failure pass: along axes, and at other levels.
 
     Args:
         found: the explanation.
@@ -420,7 +420,7 @@ def changes(found: Explanation, case: Case) -> Iterator[str]:
 
 
 def axes_of(found: Explanation, case: Case) -> Iterator[tuple[Axis, str, str]]:
-    """Yield what was changed in an explanation, with its name and its unit.
+    """Yield the changed quantities of an explanation, each with its name and its unit.
 
     Args:
         found: the explanation.
@@ -442,7 +442,7 @@ def _axis(axis: Axis, name: str, unit: str) -> str:
 
 @lines_of.register
 def vut_check_lines(found: VutCheck) -> list[str]:
-    """Return the problems in sentences, and the cost of a step.
+    """Return the problems in sentences, and the time of a step.
 
     Args:
         found: the check.
@@ -459,7 +459,7 @@ def vut_check_lines(found: VutCheck) -> list[str]:
 
 
 def notes_of(run: RecordedCampaign) -> list[str]:
-    """Return sentences on doubts about a campaign, and on cases that ran again.
+    """Return the warnings about a campaign, and a sentence on cases that ran again.
 
     Args:
         run: the campaign.
@@ -488,12 +488,12 @@ def timelines(run: RecordedCampaign, outcomes: Sequence[Outcome]) -> dict[int, T
 
 
 def _avoidance(one: Avoidance) -> list[Event]:
-    """Return who would have avoided a failure from its start, and until when by taking over."""
+    """Return the drivers that avoid a failure from its start, and the last time to take over."""
     by = either(one.avoided_by) if one.avoided_by else "no reference driver"
-    text = f"avoidable from the start by {by} in the VUT's place"
+    text = f"in the VUT's place, {by} avoids this from the start"
     events = [Event(0.0, f"{text}; a careful POV avoids it" if one.pov_careful else text)]
     if one.latest_takeover_s is not None:
-        text = f"last moment at which the reference driver {TAKES_OVER} could take over"
+        text = f"last time at which the reference driver {TAKES_OVER} could still take over"
         events.append(Event(one.latest_takeover_s, text))
     return events
 
@@ -518,11 +518,11 @@ def episode_lines(
 
 
 def _measures(outcome: Outcome) -> Iterator[str]:
-    """Yield a line for each measure with a label, of the car that the VUT meets, and the faults."""
+    """Yield a line for each measure with a label, of the car that the VUT meets, and errors."""
     found, scenario = outcome.measures, outcome.case.scenario
     car = NAMES[found.nearest]
     if car != "POV":
-        yield f"  of the {car}, which is nearest to the VUT at the end:"
+        yield f"  measures of the {car}, which is nearest to the VUT at the end:"
     rows = []
     for name, measure in recorded_measures(scenario).items():
         value = found.value(name)
@@ -530,7 +530,7 @@ def _measures(outcome: Outcome) -> Iterator[str]:
             label = scenario.wording(measure.label).replace("POV", car)
             rows.append((f"  {label}", f"{value:8.2f} {measure.unit}"))
     if found.clipped_steps:
-        rows.append(("  steps beyond its limits", f"{found.clipped_steps:8d}"))
+        rows.append(("  steps beyond the VUT's limits", f"{found.clipped_steps:8d}"))
     if outcome.is_tested and found.error is not None:
         rows.append(("  error after M", found.error))
     yield from aligned(rows, left=2)
@@ -539,7 +539,7 @@ def _measures(outcome: Outcome) -> Iterator[str]:
 def _motion_lines(trajectory: Trajectory, first: int) -> list[str]:
     """Return the motion from a row on: a row for each second, for the merge, and for the end.
 
-    Of every vehicle x in m, v in m/s and a in m/s2; then the signals of the VUT.
+    A row has x in m, v in m/s and a in m/s2 of every vehicle, and the signals of the VUT.
     """
     motion, merge = trajectory.whole, len(trajectory.motion) - 1
     last = len(motion) - 1

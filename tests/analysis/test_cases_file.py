@@ -240,9 +240,7 @@ def test_a_failure_that_is_accepted_is_said_and_not_counted(file, command_line, 
     assert CasesFile(new).accepted == {index: "it waits\x1b"}
     said = command_line("rerun", file, index)
     assert said.code == 0
-    assert (
-        f"case {index} is accepted (it waits\\x1b) and passes now: take the mark away" in said.out
-    )
+    assert f"case {index} is accepted (it waits\\x1b) and passes now: remove the mark" in said.out
     assert_refused(command_line("rerun", file, 999), f"{file} has no case 999")
 
 

@@ -92,7 +92,7 @@ def test_of_a_controller_that_errs_says_so_or_is_not_measured():
     run = api.campaign("own.py:Broken", level=0, seed=4, cases=4, out="broken", progress=False)
     assert SHARES.read(run.folder) is None
     command = "merge-sumo probability broken --vut own.py:Broken"
-    assert f"is measured by\n             {command}" in str(run)
+    assert f"to measure it, run\n             {command}" in str(run)
 
 
 def test_of_a_campaign_of_uniform_cases_is_that_of_its_own_cases(tmp_path):
@@ -122,5 +122,5 @@ def test_no_share_or_probability_is_stated_of_a_vut_that_never_merges(tmp_path, 
     assert "POV level   failures found" in str(run), "and no share"
     found = api.probability(run, vut=Parked, cases=20)
     assert found.lines() == [
-        "P(fail) is not known: no case was judged, the VUT never reached the merge point"
+        "P(fail) is unknown: no case was judged, the VUT never reached the merge point"
     ]

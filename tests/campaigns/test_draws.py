@@ -38,7 +38,7 @@ def test_counts_cases_and_not_runs(tmp_path):
     assert opened.summary.cases == len(by_case(opened.recorded.outcomes)) == 20
     facts = {fact.name: fact.value for fact in opened.facts}
     assert facts["runs"] == 60
-    assert facts["share of its runs in which a case may fail"] == 30.0
+    assert facts["tolerated share of failing runs of a case"] == 30.0
     assert len(opened.failures) == len(failing)
     (gate,) = opened.gates
     assert gate.met

@@ -185,7 +185,7 @@ def test_an_explanation_by_another_vut_names_it(command_line, tmp_path):
     run = run_campaign(settings, tmp_path / "run")
     said = command_line("explain", run.folder, "--vut", "design1?gap_m=30")
     assert said.code == 0, said.err
-    assert "  so far design1; with design1?gap_m=30:\n" in said.out
+    assert "  before: design1; with design1?gap_m=30:\n" in said.out
     assert "so far" not in command_line("explain", run.folder).out
 
 

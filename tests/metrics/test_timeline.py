@@ -135,8 +135,8 @@ class TestTheTimelineOfAFailure:
                 "unsafe",
                 "cut in, harsh",
                 [
-                    f"{REACHES} 9.0 m ahead of the POV: the POV has to brake at -8.0 m/s2",
-                    "8.1 s   the POV brakes hardest of those behind: -4.0 m/s2, down to 26.0 m/s",
+                    f"{REACHES} 9.0 m ahead of the POV: the POV must brake at -8.0 m/s2",
+                    "8.1 s   the POV brakes hardest: -4.0 m/s2, down to 26.0 m/s",
                 ],
             ),
             (
@@ -148,8 +148,8 @@ class TestTheTimelineOfAFailure:
                 "unsafe",
                 "squeeze, harsh",
                 [
-                    f"{REACHES} 20.0 m behind the POV: the VUT has to brake at -4.2 m/s2",
-                    "8.0 s   the VUT brakes hardest of those behind: -4.0 m/s2, down to 14.0 m/s",
+                    f"{REACHES} 20.0 m behind the POV: the VUT must brake at -4.2 m/s2",
+                    "8.0 s   the VUT brakes hardest: -4.0 m/s2, down to 14.0 m/s",
                 ],
             ),
             (

@@ -16,7 +16,7 @@ from merge_sumo.scenario.scenario import US23
 
 FACTS = """\
 VUT: design2
-a case fails with: front bumpers within 6 m when the VUT reaches the merge point
+failure criterion: front bumpers within 6 m when the VUT reaches the merge point
 cases: 480
 failures: 180
 cases with contact that are not failures: 25
@@ -62,8 +62,8 @@ def test_says_each_number_once_in_columns():
     assert printed(FACTS) == PRINTED
     some = FACTS.replace("fsm avoids: 180", "fsm avoids: 0")
     assert "all 180 by careful, reg157, rss; none by fsm; 169 by a careful POV" in printed(some)
-    some += "\nfailures that reference drivers drove: 500"
-    assert "Avoidable:   of 500 that were driven again: 180 by careful, reg157" in printed(some)
+    some += "\nfailures that ran again with reference drivers: 500"
+    assert "Avoidable:   of the 500 worst: 180 by careful, reg157" in printed(some)
 
 
 def test_never_shows_as_a_zero_what_was_not_tested():

@@ -86,6 +86,6 @@ def test_shows_each_case_once_with_the_share_of_its_runs_that_fail(made, browser
         each = ", ".join(f"{one} {'fails' if fails else 'passes'}" for one, fails in cases[start])
         assert (
             f"Fails in {failures[start]} of {RUNS} runs (95 % interval {low} to {high} %): {each}. "
-            f"Shown is run {index}, which decides."
+            f"Run {index} decides the result and is shown."
         ) in opened.locator("#case-words").inner_text()
         assert dict(cases[start])[index] == (failures[start] > TOLERATED * RUNS)

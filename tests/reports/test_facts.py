@@ -54,7 +54,7 @@ def test_are_what_the_lines_of_the_folder_say(made, facts):
         "failures": len(failing),
         "failures with contact": sum(row["severity"] == "contact" for row in failing),
         "worst case": min(failing, key=lambda row: (row["score"], row["index"]))["index"],
-        "simulated time up to M": sum(row["t_end_s"] for row in rows) / 3600.0,
+        "simulated time up to the merge": sum(row["t_end_s"] for row in rows) / 3600.0,
         "failures that driver careful avoids": 1,
         "failures that driver fsm avoids": 0,
         "failures that a careful POV avoids": 1,
@@ -105,9 +105,9 @@ def test_stand_on_the_first_screen(made):
         return [" ".join(one.text_content().split()) for one in page.find_class(name)]
 
     assert said("sentence") == [
-        "The vehicle under test (VUT) is handmade, on the road us23: 180 cases against another"
-        " vehicle (POV) that reacts at three levels. A case fails with front bumpers within 6 m"
-        " when the VUT reaches the merge point."
+        "handmade drives the vehicle under test (VUT) in 180 cases on the road us23. Another"
+        " vehicle (POV) on the main road reacts at three levels. Failure criterion: front"
+        " bumpers within 6 m when the VUT reaches the merge point."
     ]
     assert "their front bumpers are more than 6 m apart at the merge point" in said("strip")[0]
     avoided = page.xpath("//div[@class='avoided']//dd/text()")

@@ -86,7 +86,7 @@ class TestTheReportOfACampaignThatRuns:
         report.rewrite()
         root = html.parse(run.folder / REPORT).getroot()
         assert root.xpath("//meta[@http-equiv='refresh']/@content") == [str(REPORT_EVERY_S)]
-        assert "This campaign runs, 90 cases in all" in root.text_content()
+        assert "This campaign is still running; it has 90 cases in total" in root.text_content()
         failing = [o for o in run.outcomes if o.failed]
         assert root.xpath("//tr[@class='all']//b/text()") == ["60", str(len(failing))]
         before = (run.folder / REPORT).read_bytes()

@@ -125,7 +125,7 @@ class TestALongCampaign:
             counted += np.sum(of_level["counts"][0])
         assert counted == len(made.outcomes) - 50
         root = root_of(page)
-        assert f"how many of the {counted} further cases" in " ".join(root.text_content().split())
+        assert f"counts of the {counted} further cases" in " ".join(root.text_content().split())
         shown = set(data["cases"]["index"])
         assert {int(n) for n in root.xpath("//button/@data-case")} <= shown
 

@@ -3,7 +3,7 @@ const panel = byId("case"), buttons = [...document.querySelectorAll(".pairs butt
 const rows = buttons.map((button) => button.closest("tr"));
 const figures = [...document.querySelectorAll(".view")], sides = [...document.querySelectorAll(".side")];
 
-function show(n) { // cases 2 n and 2 n + 1 are those of the earlier and the later version
+function show(n) { // case 2 n is of the earlier version, case 2 n + 1 of the later version
   byId("case-title").textContent = signed(rows[n].dataset.title);
   for (const [k, side] of sides.entries()) {
     const i = 2 * n + k, replay = side.querySelector("code");

@@ -20,7 +20,7 @@ function draw(parent, tag, attributes = {}, text = null) {
 const clamp = (value, low, high) => Math.min(Math.max(value, low), high);
 const fixed = (value, digits) => value.toFixed(digits).replace("-", "\u2212");
 const signed = (text) => text.replace(/(^|[\s(])-(?=[\d.])/g, "$1\u2212").replace(/m\/s2\b/g, "m/s\u00b2");
-// Numbers of the page as those of maps and charts; what others wrote, and what may be copied into a shell, stays.
+// Write numbers of the page as in maps and charts, except in texts of users and in commands.
 const texts = document.createTreeWalker(document.body, NodeFilter.SHOW_TEXT);
 while (texts.nextNode()) if (!texts.currentNode.parentElement.closest("script, code, pre, .message, .note, .settings, .untested, h1, option")) texts.currentNode.data = signed(texts.currentNode.data);
 const bytes = (text) => Uint8Array.from(atob(text), (c) => c.charCodeAt(0));
@@ -33,7 +33,7 @@ const speedAt = (k) => speeds.getUint16(2 * k, true) * data.speed_unit_mps;
 let packed = 0;
 const firstRows = (cases.rows ?? []).map((rows) => (packed += rows) - rows); // of each case, in the speeds
 function motion(i) {
-  // Speeds are kept; positions follow by x' = x + v dt, as the vehicles moved.
+  // The data has speeds; positions follow by x' = x + v dt, as the vehicles moved.
   const rows = cases.rows[i], first = firstRows[i];
   if (!rows) return null;
   const v = vehicles.map((_, who) => Array.from({ length: rows }, (_, t) => speedAt((first + t) * vehicles.length + who)));
@@ -42,7 +42,7 @@ function motion(i) {
     for (let t = 1; t < rows; t++) places.push(places[t - 1] + speed[t - 1] * DT);
     return places;
   });
-  // Behind this row all drive on after the merge.
+  // After this row the follow-up begins.
   const until = Math.round(cases.t_end_s[i] / DT);
   const merge = LANE && cases.end[i] === "MERGED" ? x[VUT][until] : null;
   return { rows, v, x, met: cases.nearest[i], merge, until };
@@ -135,7 +135,7 @@ function TopView(svg) {
   this.show = (motion) => {
     this.moving = motion;
     svg.replaceChildren();
-    // A lane is 3.2 m wide: what is left free between two lanes is the line between them.
+    // A lane is 3.2 m wide: the free space between two lanes is the line between them.
     for (const lane of [data.main, data.ramp]) draw(svg, "path", { class: "lane", d: path(lane.map(([, x, y]) => [x, -y])), "stroke-width": 3.05 });
     LANE ? drawLane() : draw(svg, "line", { class: "merge", x1: 0, x2: 0, y1: -2.6, y2: 2.6, "stroke-width": 0.25 });
     layer = draw(svg, "g");
@@ -155,7 +155,7 @@ function TopView(svg) {
     draw(svg, "line", { class: name, x1: a.x - u, y1: -(a.y - v), x2: b.x + u, y2: -(b.y + v), "stroke-width": 0.25 });
   };
   const drawLane = () => { // the acceleration lane, and where the VUT left it
-    const begin = LANE[0] + 0.01, end = LANE[1] - 0.01; // at its very ends are those of other lanes, too
+    const begin = LANE[0] + 0.01, end = LANE[1] - 0.01; // its ends are also points of other lanes
     const inside = data.ramp.filter(([at]) => at > begin && at < end).map(([at]) => at);
     const points = [begin, ...inside, end].map((at) => pose(data.ramp, at));
     draw(svg, "path", { class: "window", d: path(points.map(({ x, y }) => [x, -y])), "stroke-width": 3.05 });

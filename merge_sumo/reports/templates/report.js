@@ -1,11 +1,11 @@
 // The report around its player (player.js): maps, the view of a case, and the table of all cases.
-const coordinates = data.coordinates; // of all levels; the last ones are those of some levels only
+const coordinates = data.coordinates; // of all levels; the last ones belong to some levels only
 const place = new Map(cases.index.map((index, i) => [index, i]));
 
 /* ---------- cases ---------- */
 const failed = (i) => cases.failed[i];
-const undecided = (i) => cases.undecided[i]; // it fails, and ran too seldom to tell
-let matching = null; // the cases that the filters let through; null without a filter
+const undecided = (i) => cases.undecided[i]; // it fails, and has too few runs to tell
+let matching = null; // the cases that match the filters; null without a filter
 const wanted = (i) => matching === null || matching.has(i);
 function avoidedBy(i, who) { // a driver, "pov" or "none"
   const known = failed(i) ? cases.avoidance[i] : null;
@@ -15,7 +15,7 @@ function avoidedBy(i, who) { // a driver, "pov" or "none"
 }
 const tested = (i) => failed(i) || cases.end[i] === "MERGED";
 const severity = (i) => cases.severity[i];
-function drawMark(parent, i, x, y, faint) { // shape and colour by severity; what fails is large
+function drawMark(parent, i, x, y, faint) { // shape and colour by severity; failures are large
   const found = severity(i), large = failed(i);
   const look = { class: `mark ${found ?? (large ? "unclassed" : "error")}${large ? " fail" : ""}${faint}`, "data-case": cases.index[i] };
   const r = large ? 5 : 3.4;
@@ -36,7 +36,7 @@ function runsInWords(i) {
   const runs = runsOf(i), percent = (share) => fixed(100 * share, 0);
   if (!runs) return cases.runs && tested(i) ? "This case ran once." : "";
   const each = runs.each.map(([index, fails]) => `${index} ${fails ? "fails" : "passes"}`).join(", ");
-  return `Fails in ${runs.failed} of ${runs.number} runs (95 % interval ${percent(runs.low)} to ${percent(runs.high)} %): ${each}. Shown is run ${cases.index[i]}, which decides.`;
+  return `Fails in ${runs.failed} of ${runs.number} runs (95 % interval ${percent(runs.low)} to ${percent(runs.high)} %): ${each}. Run ${cases.index[i]} decides the result and is shown.`;
 }
 const rank = (i) => (severity(i) === null ? data.severities.length : data.severities.indexOf(severity(i))); // the most severe lie on top
 const valueText = (c, value) => `${fixed(value, c.digits)} ${c.unit}`;
@@ -162,8 +162,8 @@ function FailureMap(figure) {
       const off = (mark) => Math.hypot(mark.x - x, mark.y - y);
       const at = inside.reduce((best, mark) => (off(mark) < off(best) ? mark : best));
       const side = at.x > left + width - 24 ? -1 : 1, spot = { x: at.x + side * 10, y: clamp(at.y + 4, top + 11, top + height - 3) };
-      const beside = taken.find(({ x, y }) => Math.abs(x - spot.x) < 14 && Math.abs(y - spot.y) < 11);
-      if (beside) { beside.text.textContent += `, ${region.number + 1}`; continue; }
+      const other = taken.find(({ x, y }) => Math.abs(x - spot.x) < 14 && Math.abs(y - spot.y) < 11);
+      if (other) { other.text.textContent += `, ${region.number + 1}`; continue; }
       const text = draw(svg, "text", { class: "named number", ...spot, "text-anchor": side < 0 ? "end" : "start" }, String(region.number + 1));
       taken.push({ ...spot, text });
     }
@@ -243,12 +243,12 @@ function ticks(step) {
 
 /* ---------- a case: road, motion, charts ---------- */
 const panel = byId("case");
-function dock(on) { // at the foot of the window, or in its place next to the maps
+function dock(on) { // at the bottom of the window, or in its place next to the maps
   panel.classList.toggle("docked", on);
   byId("close").hidden = !on;
   if (moving) at(step);
 }
-function openCase(i, element = null) { // asked for by the reader: it is in sight, and so is what was clicked
+function openCase(i, element = null) { // the reader opens a case: keep the case and the clicked element in sight
   tip(null);
   const before = element?.getBoundingClientRect().top;
   show(i);
@@ -257,7 +257,7 @@ function openCase(i, element = null) { // asked for by the reader: it is in sigh
   const { top, height } = panel.getBoundingClientRect();
   if (top < 0 || top + Math.min(height, 380) > innerHeight) dock(true);
   if (!element) return;
-  // What was clicked stays where it is, or comes up as far as the case would hide it.
+  // The clicked element keeps its place, or moves up as far as the case would hide it.
   const at = element.getBoundingClientRect(), room = panel.classList.contains("docked") ? panel.getBoundingClientRect().top - 12 - at.height : Infinity;
   scrollBy({ top: at.top - Math.min(before, room), behavior: "instant" });
 }
@@ -265,7 +265,7 @@ function openCase(i, element = null) { // asked for by the reader: it is in sigh
 /* ---------- the address: #case-111&verdict=failure ---------- */
 const form = byId("filters"), FILTERS = ["level", "verdict", "severity", "region", "kind", "avoided", "measure", "from", "to"];
 let opened = -1; // the case that the reader asked for
-function filtersSet() { // [name, value] of what is not as it was
+function filtersSet() { // [name, value] of each filter that is set
   const bounded = form.elements.from.value !== "" || form.elements.to.value !== "";
   return FILTERS.map((name) => [name, form.elements[name]?.value ?? ""]).filter(([name, value]) => value !== "" && (name !== "measure" || bounded));
 }
@@ -279,7 +279,7 @@ function openLinked() {
   if (place.get(index) !== opened) openCase(place.get(index));
   return true;
 }
-function restore() { // an address is data: what it names that is not here is left out
+function restore() { // an address is data: skip unknown names and values
   const query = new URLSearchParams(location.hash.slice(1));
   form.reset();
   for (const name of FILTERS) {
@@ -292,7 +292,7 @@ function restore() { // an address is data: what it names that is not here is le
 addEventListener("hashchange", () => { restore(); filter(); openLinked(); });
 addEventListener("keydown", (event) => { if (event.key === "Escape") dock(false); });
 addEventListener("beforeprint", () => { byId("facts").closest("details").open = true; });
-addEventListener("scroll", () => { // back where its place is in sight
+addEventListener("scroll", () => { // undock the case when its place is in sight
   const { top } = byId("case-place").getBoundingClientRect();
   if (panel.classList.contains("docked") && top >= 0 && top + 380 <= innerHeight) dock(false);
 }, { passive: true });
@@ -311,7 +311,7 @@ function show(i) {
   for (const button of document.querySelectorAll("[data-case]")) {
     button.closest("tr")?.classList.toggle("on", Number(button.dataset.case) === cases.index[i]);
   }
-  byId("case-role").textContent = cases.index[i] !== Number(panel.dataset.first) ? verdict(i) : failed(i) ? `worst case${undecided(i) ? ", undecided" : ""}` : tested(i) ? "no failure, but the nearest to one" : verdict(i);
+  byId("case-role").textContent = cases.index[i] !== Number(panel.dataset.first) ? verdict(i) : failed(i) ? `worst case${undecided(i) ? ", undecided" : ""}` : tested(i) ? "no failure; the case nearest to one" : verdict(i);
   byId("case-role").title = cases.margin[i] === null || !tested(i) ? "" : `margin ${fixed(cases.margin[i], 3)}${failed(i) && cases.index[i] === Number(panel.dataset.first) ? ": the lowest of all cases" : ""}`;
   moving = motion(i);
   byId("case-motion").hidden = moving === null;
@@ -348,7 +348,7 @@ function timeline(i) { // the events of a case as a list, and as marks on the ti
   byId("case-timeline").replaceChildren(...lines);
   byId("marks").replaceChildren(...marks);
 }
-function whyCharts(i) { // with which changes a failure passes
+function whyCharts(i) { // changes that make a failure pass
   const found = data.why[cases.index[i]];
   byId("why-known").hidden = !found;
   byId("why-ask").hidden = Boolean(found);
@@ -356,7 +356,7 @@ function whyCharts(i) { // with which changes a failure passes
   byId("why-words").replaceChildren(...found.words.map((text) => Object.assign(document.createElement("li"), { textContent: signed(text) })));
   drawAxes(byId("why-changes"), found.axes);
 }
-function drawAxes(svg, axes) { // a bar for each thing: what fails around the case, and the nearest values that pass
+function drawAxes(svg, axes) { // a bar for each quantity: failing values around the case, and the nearest passing values
   const height = 56, [left, right] = [62, 298];
   svg.setAttribute("viewBox", `0 0 360 ${axes.length * height}`);
   svg.replaceChildren();
@@ -376,7 +376,7 @@ function drawAxes(svg, axes) { // a bar for each thing: what fails around the ca
     for (const end of [from, to]) draw(svg, "text", { class: "edge", x: X(end), y: y + 45, "text-anchor": "middle" }, fixed(end, digits));
   }
 }
-function signalCharts(i, end) { // what the VUT has left for each step: numbers as a line, words as bars
+function signalCharts(i, end) { // signals of the VUT at each step: numbers as a line, words as bars
   const box = byId("signals"), left = Object.entries(data.signals[cases.index[i]] ?? {});
   box.replaceChildren();
   box.hidden = left.length === 0;
@@ -431,7 +431,7 @@ for (const table of document.querySelectorAll(".list")) {
 
 /* ---------- all cases ---------- */
 const verdict = (i) => (undecided(i) ? "undecided" : failed(i) ? "failure" : tested(i) ? "no failure" : cases.end[i]);
-function allCases() { // gives what shows the cases that the filters let through
+function allCases() { // returns a function that shows the cases that match the filters
   const head = byId("table").tHead.rows[0], body = byId("table").tBodies[0], more = byId("more");
   const { level, severity: severe, verdict: ended, region, kind, measure, from, to } = form.elements, avoided = form.elements.avoided; // null where that is not known
   const number = (key, name, digits) => ({ name, exact: true, value: (i) => cases[key][i], text: (value) => fixed(value, digits) });
@@ -510,18 +510,18 @@ function allCases() { // gives what shows the cases that the filters let through
     for (const map of maps) region.value.startsWith(`${map.level}:`) ? map.showAll() : map.draw();
     for (const button of document.querySelectorAll("[data-filter]")) button.setAttribute("aria-pressed", form.elements[button.dataset.filter].value === button.dataset.value);
     byId("filtered").hidden = matching === null;
-    byId("filtered-number").textContent = `${found.length} of ${all.length} cases are let through by the filters; the others are faint.`;
+    byId("filtered-number").textContent = `${found.length} of ${all.length} cases match the filters. The others are faint.`;
     if (chosen >= 0) byId("case-link").href = address(chosen);
   };
   const list = () => {
-    found.sort((a, b) => { // what has no value is last, whichever way
+    found.sort((a, b) => { // rows without a value are last in both directions
       const [x, y] = [a, b].map((i) => (by.value(i) === null ? null : (by.order ?? by.value)(i)));
       return (x === null) - (y === null) || (x < y ? -way : x > y ? way : a - b);
     });
     for (const [n, cell] of [...head.cells].entries()) {
       columns[n] === by ? cell.setAttribute("aria-sort", way > 0 ? "ascending" : "descending") : cell.removeAttribute("aria-sort");
     }
-    byId("matching").textContent = matching ? `${found.length} of ${all.length} cases.` : "";
+    byId("matching").textContent = matching ? `${found.length} of ${all.length} cases match the filters.` : "";
     body.replaceChildren();
     rows = 0;
     extend();
