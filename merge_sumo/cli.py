@@ -1,6 +1,6 @@
-"""The command line: each command parses a config, passes its fields to a verb, and prints.
+"""The command line: each command parses a config, passes its fields to a function, and prints.
 
-The verbs are the functions of `api.py`; `api.verb` makes the config of a verb from the fields.
+The functions are in `api.py`, where `api.verb` makes their config from the fields.
 """
 
 from __future__ import annotations
@@ -98,7 +98,7 @@ GONE: Mapping[str, str] = {
 }
 """Replacements of commands of earlier versions, by name."""
 FAULT = 70
-"""Exit code of a bug in this package, as EX_SOFTWARE of sysexits.h."""
+"""Exit code of a bug in this package: EX_SOFTWARE of sysexits.h."""
 
 Options = Annotated[T, Parameter(name="*")]
 Json = Annotated[bool, Parameter(help="Print the result as one JSON object.")]
@@ -181,7 +181,7 @@ app = Commands(
 )
 scenario = Commands(
     name="scenario",
-    help="List, write and check scenarios: a road with a merge, and its numbers.",
+    help="List, write and check scenarios: roads with a merge, and their numbers.",
     group=OWN,
 )
 app.command(scenario)
@@ -251,9 +251,7 @@ def campaign(
 def run(
     vut: Annotated[
         str | None,
-        Parameter(
-            help="Vehicle under test, as in `campaign`. [default: with --case that of the campaign]"
-        ),
+        Parameter(help="Vehicle under test, as in `campaign`. Not necessary with --case."),
     ] = None,
     config: Options[c.CaseOptions] = c.CaseOptions(),
     *,
@@ -357,10 +355,10 @@ def rerun(
     stress: Annotated[
         bool,
         Parameter(
-            help="""Keep the VUT and change the simulation. Failures that fail each time are robust.
+            help="""Keep the VUT and change the simulation, to find robust failures.
 
-            The changes are a shorter step, an actuator with a lag, limited power, a start with the
-            error of a sensor, and longer cars.""",
+            A failure is robust if it fails with each change: a shorter step, an actuator with a
+            lag, limited power, a start with the error of a sensor, and longer cars.""",
         ),
     ] = False,
     json: Json = False,

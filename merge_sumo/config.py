@@ -1,11 +1,13 @@
-"""Settings of the verbs: one dataclass each, whose fields are keywords in Python and options.
+"""Settings of the functions: one dataclass each. Its fields are keywords in Python, and options.
 
-Shared fields stand in base classes. `None` means: as in the scenario; for a recorded campaign: as
-it was recorded. An option has the name of its field, unless `FLAGS` gives another.
+The first paragraph of a field's docstring is what `--help` shows. Further paragraphs are in the
+reference and in Python's help. Base classes have the fields that several functions share. `None`
+means: as in the scenario, or for a recorded campaign: as recorded. An option has the name of its
+field, unless `FLAGS` gives another.
 
-A field of `ScenarioChanges` has the name of a field of `Scenario`, which it replaces
-(`from_config.scenario_from`). One of `Search`, `FailureRule` or `Limits` is a field of
-`CampaignSettings`. `load_plan` gives the criterion to `SimulationPlan`, and the limits to its
+A field of `ScenarioChanges` replaces the field of `Scenario` with the same name
+(`from_config.scenario_from`). The fields of `Search`, `FailureRule` and `Limits` are fields of
+`CampaignSettings`. `load_plan` passes the criterion to `SimulationPlan`, and the limits to the
 controllers, as `ControllerOptions`.
 """
 
@@ -60,7 +62,7 @@ FLAGS: Mapping[str, str] = {
     "params": "--param",
     "file_format": "--format",
 }
-"""Options with another name than their field."""
+"""Options that are not named like their field."""
 
 
 def flag_of(name: str) -> str:
@@ -102,7 +104,7 @@ class Drivers(Limits, Policies):
     """Drivers and limits of controllers."""
 
     pov: AnyVut | None = None
-    """A POV of your own, which drives at level own.
+    """Your own POV, which drives at level own.
 
     It can be of any kind that --vut takes, except traci.
     """
@@ -124,7 +126,7 @@ class FailureRule:
     default is paper where the road has a merge point, and unsafe where it has an acceleration lane.
     """
     require: str | None = None
-    """Requirement over time in signal temporal logic, not with --fail-when.
+    """Requirement in signal temporal logic, instead of --fail-when.
 
     A case fails if it violates the formula, such as 'always ((x_vut_m > -20) implies (bumper_gap_m
     > 2))'. Install the extra stl for it: `pip install 'merge-sumo[stl]'`.
@@ -136,7 +138,7 @@ class ScenarioChanges:
     """Settings that replace those of the scenario."""
 
     follow_up_s: float | None = None
-    """Seconds simulated after the merge. [default: 3, on a lane 5]
+    """Seconds simulated after the merge. [default: 3, or 5 on a lane]
 
     With 0 an episode ends at the merge. The default is 3, and 5 on an acceleration lane.
     """
@@ -186,7 +188,7 @@ class Search:
     batch: int | None = None
     """Cases per batch. [default: chosen by the sampler]"""
     in_flight: int | None = None
-    """Keep up to this many cases running or waiting, without batches.
+    """Number of cases that run or wait at a time, without batches.
 
     This suits controllers that take seconds for a case: the sampler proposes more cases while
     others run. About three times the number of workers is a good value.
@@ -202,7 +204,7 @@ class Search:
     seed: int = 0
     """Random seed. The same seed gives the same outcomes."""
     stop_when_converged: bool = False
-    """Stop as soon as the search has converged, before --cases.
+    """Stop before --cases if the search has converged.
 
     It has converged when the last 100 cases have added less than 1 % to the coverage.
     """
@@ -281,7 +283,7 @@ class Beginning:
     """The part of a case that is shown."""
 
     from_s: float | None = None
-    """Start relative to the first conflict, such as -3.
+    """First time to show, relative to the first conflict, such as -3.
 
     The first conflict is the contact. Without a contact it is the lowest time to collision or the
     merge, and without a merge it is the end of the case.
@@ -293,13 +295,15 @@ class Beginning:
 
 @dataclass(frozen=True, kw_only=True)
 class CampaignOptions(Execution, Junit, Test, Search, Levels):
-    """Test a VUT: run cases in SUMO, find failures, and write a report.
+    """Test a controller: run cases in SUMO, find failures, and write a report.
 
-    The run folder also contains the worst failures as scenarios that `replay` can show. Ctrl-C ends
-    the campaign after the running batch and prints how to continue. A second Ctrl-C stops at once.
+    The controller drives the vehicle under test (VUT). The primary other vehicle (POV) reacts to
+    it. The run folder also contains the worst failures as scenarios that `replay` can show. Ctrl-C
+    ends the campaign after the running batch and prints how to continue. A second Ctrl-C stops at
+    once.
 
-    Exit codes: 0 finished, 1 a --gate is met or the VUT merged in no case, 2 wrong usage, 130 or
-    143 stopped.
+    Exit code: 0 if finished, 1 if a --gate is met or the VUT merged in no case, 2 for wrong usage,
+    130 or 143 if stopped.
 
     Example:  merge-sumo campaign --vut design1 --level 0 --cases 400 --seed 1
 
@@ -374,7 +378,8 @@ class Resume(CampaignCalls):
 class CaseOptions(Beginning, Test):
     """Run one case and print its result, its measures and its motion.
 
-    Exit codes: 0 the case passes, 1 it fails, ends in an error or times out, 2 wrong usage.
+    Exit code: 0 if the case passes, 1 if it fails, ends in an error or times out, 2 for wrong
+    usage.
 
     Example:  merge-sumo run --vut design2 --level 2 --x -298.6 --v 34.5 --psi 0.62
     """
@@ -401,8 +406,8 @@ class CaseOptions(Beginning, Test):
     out: AnyPath | None = None
     """New folder for the case, which `replay` and sumo-gui can show."""
     recorded: tuple[AnyRun, int] | None = None
-    """A case of a campaign: its folder and the index. Its values are the defaults of all other
-    options."""
+    """A recorded case: the folder of the campaign and the index of the case. Other options override
+    its values."""
 
 
 COORDINATE_OPTIONS = ("x_pov0_m", "v_pov0_mps", "svo_rad", "headway_ahead_s", "headway_behind_s")
@@ -430,8 +435,8 @@ class Probability(EngineChoice, StudyOptions):
 
     The cases of the campaign were chosen to fail, so their share of failures is not a probability.
     They show where failures are expected. merge-sumo draws new cases from there and, separately,
-    from the rest. The interval is exact even if the expectation is wrong. Failures in the rest are
-    failures that the campaign has missed.
+    from the rest of the pool. The interval is exact even if the expectation is wrong. Failures in
+    the rest are failures that the campaign has missed.
 
     Example:  merge-sumo probability runs/design2
 
@@ -442,7 +447,7 @@ class Probability(EngineChoice, StudyOptions):
     """The campaign, or its folder."""
     _: KW_ONLY
     cases: int | None = None
-    """Number of new cases. [default: 100000, in SUMO 4000]"""
+    """Number of new cases. [default: 100000, or 4000 in SUMO]"""
     traffic: AnyPath | None = None
     """Also estimate failures per merge in traffic: exid-2, exid-3, exid-5, or a TOML file.
 
@@ -463,12 +468,12 @@ class Probability(EngineChoice, StudyOptions):
 
 @dataclass(frozen=True)
 class Explain(StudyOptions):
-    """Explain a failure: find the smallest change of one value with which the case passes.
+    """Explain a failure: find the smallest change of one value that makes the case pass.
 
     merge-sumo changes one value at a time: a coordinate of the start, the level of the POV, or a
     parameter of the controller. It runs the case with other values, and runs each printed value
-    twice. A campaign explains its worst failure by itself, without parameters, if the VUT is of
-    this package. `report` shows all failures that were explained.
+    twice. A campaign explains its worst failure automatically, without parameters, if the VUT is of
+    this package. `report` shows all explanations.
 
     Example:  merge-sumo explain runs/design1
     """
@@ -517,7 +522,7 @@ class ReplayCase(Beginning):
     A case of a campaign is exported first. The command prints the motion, then "identical" or
     "diverged at t = ...".
 
-    Exit codes: 0 identical, 1 diverged, 2 wrong usage.
+    Exit code: 0 if identical, 1 if diverged, 2 for wrong usage.
 
     Example:  merge-sumo replay scenarios/stalemate --gui --from -3
     """
@@ -558,9 +563,9 @@ class Rerun(Page, Levels, StudyOptions):
     With a controller that is not built in, each changed case runs a second time. If the second
     result differs, the case is "not repeatable" and does not count.
 
-    Exit codes: 0 no case broke, 1 a case broke: it passed and does not pass now, 2 wrong usage.
-    With a cases file also 1 for a new error or contact, or a margin that drops by more than the
-    tolerance.
+    Exit code: 0 if no case broke, 1 if a case broke, 2 for wrong usage. A case broke if it passed
+    before and does not pass now. With a cases file the exit code is also 1 for a new error or
+    contact, and for a margin that drops by more than the tolerance of the file.
 
     Example:  merge-sumo rerun runs/design2 3 7 --vut design2 --out changes.html
 
@@ -593,7 +598,7 @@ class Compare(Page):
     The command runs no cases. It pairs the cases that two campaigns share. If each campaign has its
     own cases, it compares the shares of cases that pass.
 
-    Exit codes: 0 nothing got worse, 2 wrong usage, 1 if one of these is true:
+    Exit code: 0 if nothing got worse, 2 for wrong usage, 1 if one of these is true:
 
     - a case broke
     - a version passes a smaller share of its own cases than the one before (Fisher's exact test)
@@ -619,9 +624,9 @@ class Vuts(Policies):
 
 @dataclass(frozen=True)
 class CheckVut(Limits, Policies):
-    """Check a VUT in a few cases: list its errors and the time that it takes for a step.
+    """Check a VUT in a few cases: list its errors and the time of a step.
 
-    Exit codes: 0 "nothing wrong", 1 the command lists errors, 2 wrong usage.
+    Exit code: 0 for "nothing wrong", 1 if the command lists errors, 2 for wrong usage.
 
     Example:  merge-sumo check-vut design1
     """
@@ -679,8 +684,8 @@ class CheckScenario(Policies):
 class Train:
     """Train the learned drivers, level by level, and measure their regret in SUMO.
 
-    The regret of a driver is its loss against its best response. It is a share of the gain of the
-    best response over level-0 behaviour. A training that was stopped continues.
+    The regret of a driver is its loss compared with its best response. It is a share of the gain of
+    the best response over level-0 behaviour. The command continues a training that was stopped.
 
     Example:  merge-sumo train --out my-policies --seed 1
     """
@@ -728,7 +733,7 @@ class GroundTruth(EngineChoice, Execution, Test):
     """POV levels: 0, 1, 2 or own, or several with commas."""
     _: KW_ONLY
     cases: int | None = None
-    """Uniform cases per level. [default: 10000, at level 2 20000]"""
+    """Uniform cases per level. [default: 10000, or 20000 at level 2]"""
     seed: int = 0
     """Random seed. The same seed gives the same cases."""
 
@@ -760,9 +765,9 @@ class Benchmark(Execution, Test):
     cases: int = 400
     """Number of cases of each run."""
     batch: int | None = None
-    """Cases per batch. [default: 20, for coverage its own]"""
+    """Cases per batch. [default: 20, or chosen by coverage]"""
     truth_cases: int | None = None
-    """Cases of the ground truth. [default: 10000, at level 2 20000]"""
+    """Cases of the ground truth. [default: 10000, or 20000 at level 2]"""
     figure: AnyPath | None = None
     """New figure of the FMC over the cases (.png or .svg)."""
 
@@ -777,11 +782,11 @@ class Reproduce(Execution, Policies):
     """
 
     seeds: int | None = None
-    """Number of runs of each sampler. [default: 10, with --quick 2]"""
+    """Number of runs of each sampler. [default: 10, or 2 with --quick]"""
     out: AnyPath | None = None
     """New folder to write. [default: runs/reproduce-DATE]"""
     quick: bool = False
-    """Get a first look: few and short runs, and a small ground truth."""
+    """Run a small version: few and short runs, and a small ground truth."""
 
 
 def values_of(config: object, kind: type[Any]) -> dict[str, Any]:
@@ -797,7 +802,7 @@ def values_of(config: object, kind: type[Any]) -> dict[str, Any]:
 def non_defaults(config: object, kind: type[Any]) -> dict[str, Any]:
     """Return the fields of a base class whose values are not the defaults, by name.
 
-    A default that the user wrote counts as not given.
+    A default value that the user sets explicitly is not returned.
 
     Args:
         config: the config.

@@ -1,4 +1,4 @@
-"""Printing: results on standard output, sentences for the user on standard error."""
+"""Printing: results on standard output, messages for the user on standard error."""
 
 from __future__ import annotations
 
@@ -26,9 +26,10 @@ if TYPE_CHECKING:
 
 
 def prepare_streams() -> None:
-    """Open closed standard streams to nothing, and write letters that a terminal lacks as escapes.
+    """Open closed standard streams, and write characters that a terminal lacks as escapes.
 
-    A file that is opened later would get the number of a closed stream, and its output.
+    A closed stream opens the null device. Otherwise a file that is opened later would get the
+    number of the stream, and with it the output.
     """
     for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
         if getattr(sys, name) is None:
@@ -47,13 +48,13 @@ def show(line: object) -> None:
         line: the line.
 
     Raises:
-        UserError: it cannot be written, and the result is lost.
-        Stopped: the reader has gone: the command ends as other programs do.
+        UserError: the line cannot be written, and the result is lost.
+        Stopped: the reader has closed the pipe. The command ends as other programs do.
     """
     try:
         print(printable(str(line)), flush=True)
     except OSError as error:
-        # The rest of the buffer is dropped, also when the interpreter ends.
+        # Drop the rest of the buffer, also when the interpreter ends.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         if error.errno == errno.EPIPE:
             raise Stopped(signal.SIGPIPE) from None
@@ -61,10 +62,10 @@ def show(line: object) -> None:
 
 
 def say(line: str) -> None:
-    """Print a line for the user on standard error; a line that cannot be written is lost.
+    """Print a line for the user on standard error. A line that cannot be written is lost.
 
     Args:
-        line: the line; a field in backticks becomes its option.
+        line: the line, in which a field in backticks becomes its option.
     """
     with suppress(OSError):
         print(printable(_with_flags(line)), file=sys.stderr, flush=True)
@@ -79,7 +80,7 @@ def _field_names() -> set[str]:
 
 
 def _with_flags(sentence: str) -> str:
-    """Return a sentence of the package with options in the place of keywords in backticks."""
+    """Return a sentence of the package with options instead of keywords in backticks."""
 
     def in_place(keyword: re.Match[str]) -> str:
         return config.flag_of(keyword[1]) if keyword[1] in _field_names() else keyword[0]
@@ -102,7 +103,7 @@ def print_result(result: Result, as_json: bool, **paths: object) -> int:
     Args:
         result: the result.
         as_json: whether to print JSON.
-        paths: paths that belong to the result, or None; in lines each follows its name.
+        paths: paths that belong to the result, or None. In lines each follows its name.
     """
     written = {name: str(path) for name, path in paths.items() if path is not None}
     if as_json:
@@ -117,18 +118,20 @@ def print_result(result: Result, as_json: bool, **paths: object) -> int:
 
 @contextmanager
 def stoppable() -> Iterator[Callable[[], None]]:
-    """Yield a `check` for a campaign: after Ctrl-C the running batch ends, and a sentence follows.
+    """Yield a `check` for a campaign, which stops it after the running batch if Ctrl-C was pressed.
 
-    The sentence is a note of the exception: how to continue.
+    The note of the exception, which says how to continue, is printed.
 
     Raises:
-        UserError: where the cluster of the workers is gone.
+        UserError: the connection to the workers is lost.
     """
     try:
-        with Interrupt("finishing the running batch; once more stops at once") as interrupt:
+        with Interrupt(
+            "finishing the running batch; press Ctrl-C again to stop at once"
+        ) as interrupt:
             yield interrupt.check
     except Stopped as stopped:
-        notes = getattr(stopped, "__notes__", ["before the first case; nothing was written"])
+        notes = getattr(stopped, "__notes__", ["before the first case: nothing was written"])
         say("; ".join(["stopped", *notes]))
         raise
     except WorkersLostError as lost:
@@ -137,7 +140,7 @@ def stoppable() -> Iterator[Callable[[], None]]:
 
 @contextmanager
 def notices_printed() -> Iterator[None]:
-    """Print each `Notice` on standard error; other warnings are shown as always."""
+    """Print each `Notice` on standard error, and show other warnings as usual."""
     with warnings.catch_warnings():
         warnings.simplefilter("always", Notice)
         show_warning = warnings.showwarning
