@@ -94,7 +94,7 @@ GONE: Mapping[str, str] = {
     "stress": "`merge-sumo rerun RUN --stress` replaces it",
     "repair": "`examples/repair.py`, in a checkout, searches with optuna and `merge_sumo.rerun`",
     "certify": "after a campaign without failures, `merge-sumo probability RUN --cases 100000` "
-    "gives an upper bound of the share of the pool that fails",
+    "gives an upper bound on the share of the pool that fails",
 }
 """Replacements of commands of earlier versions, by name."""
 FAULT = 70
@@ -207,8 +207,8 @@ def campaign(
     vut: Annotated[
         str,
         Parameter(
-            help="Vehicle under test: level0, level1, level2, design1, design2, or your own "
-            "controller. `merge-sumo vuts` lists all kinds.",
+            help="Vehicle under test: a built-in one, such as design2, or your own controller. "
+            "`merge-sumo vuts` lists all.",
         ),
     ] = "",
     config: Options[c.CampaignOptions] = c.CampaignOptions(),
@@ -259,7 +259,7 @@ def run(
         list[str] | None,
         Parameter(
             consume_multiple=True,
-            help="Coordinates of the case by their names in outcomes.jsonl.",
+            help="Coordinates of the case by name, such as x_pov0_m=-250 v_pov0_mps=30.",
         ),
     ] = None,
     json: Json = False,

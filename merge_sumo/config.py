@@ -81,8 +81,8 @@ class Policies:
     policies: AnyPath | None = None
     """Folder of learned drivers, or a shipped library such as human.
 
-    `merge-sumo train --out FOLDER` writes such a folder. By default each scenario has its own
-    learned drivers.
+    `merge-sumo train --out FOLDER` writes such a folder. By default it is the shipped library for
+    the scenario, or else the one for us23.
     """
 
 
@@ -217,9 +217,9 @@ class Execution:
     workers: int | str | None = 1
     """Number of worker processes, auto, or a Dask scheduler, tcp://HOST:PORT. [default: auto]
 
-    With auto each core gets one process. A campaign of up to 1,000 cases with built-in drivers then
-    uses one process in total. The number does not change the outcomes. On the command line the
-    default is auto, in Python it is 1.
+    With auto each core gets one process. A campaign of up to 1,000 cases with built-in drivers uses
+    only one. The number does not change the outcomes. On the command line the default is auto, in
+    Python it is 1.
     """
     progress: bool | None = None
     """Show progress, or hide it. [default: shown in terminals and notebooks]"""
@@ -557,8 +557,8 @@ class Rerun(Page, Levels, StudyOptions):
     The cases are those that the campaign recorded. To search for cases that only the new version
     fails, use `campaign --against`.
 
-    A cases file of `export --format cases` can replace the campaign. Then --out writes the updated
-    file.
+    A cases file of `export --format cases` can replace the campaign. Then the command prints the
+    changes compared with the file, and --out writes the updated file.
 
     With a controller that is not built in, each changed case runs a second time. If the second
     result differs, the case is "not repeatable" and does not count.

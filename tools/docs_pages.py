@@ -126,20 +126,20 @@ def options_of(command: Any) -> str:
         texts[argument.name] = as_markdown(inspect.cleandoc(argument.parameter.help or ""))
     groups: dict[str, str] = {}
     arguments = command.assemble_argument_collection(parse_docstring=True)
-    for argument in arguments.filter_by(show=True):
+    shown = arguments.filter_by(show=True)
+    for argument in sorted(shown, key=lambda each: each.index is None):  # positional ones first
         (group,) = argument.parameter.group
         panel = create_parameter_help_panel(group, type(arguments)([argument]), "plaintext")
         (entry,) = panel.entries
-        text = texts[argument.name]
+        about, *details = texts[argument.name].split("\n\n")
+        about = DEFAULT.sub(r" Default: \1.", about)
         if entry.default:
-            first, *rest = text.split("\n\n")
-            text = "\n\n".join((f"{first} Default: {entry.default}.", *rest))
-        else:
-            text = DEFAULT.sub(r" Default: \1.", text, count=1)
+            about += f" Default: {entry.default}."
+        if entry.required:
+            about += " Required."
+        text = textwrap.indent("\n\n".join((about, *details)), "    ").strip()
         names = ", ".join(entry.display_labels_with_metavar)
-        needed = " Required." if entry.required else ""
-        item = textwrap.indent(f"{text}{needed}", "    ").strip()
-        groups[group.name] = groups.get(group.name, "") + f"\n- `{names}`: {item}\n"
+        groups[group.name] = groups.get(group.name, "") + f"\n- `{names}`: {text}\n"
     return "".join(f"\n**{name}**\n{items}" for name, items in groups.items())
 
 
