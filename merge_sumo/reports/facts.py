@@ -219,7 +219,7 @@ def _motion(run: RecordedCampaign, undecided: frozenset[int], failing: str) -> F
     worst = failed[0]
     yield Fact(WORST, worst.index, "lowest margin")
     kind = timelines(run, [worst])[worst.index].result
-    yield Fact(KIND, kind, "severity, impact_speed_mps; by its motion")
+    yield Fact(KIND, kind, "severity, impact_speed_mps; and its motion")
     decided = [outcome for outcome in failed if outcome.index not in undecided]
     if avoidable := _values(decided, "avoidable"):
         name = "failures that full braking or full acceleration of the VUT avoids"

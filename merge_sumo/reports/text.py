@@ -359,7 +359,7 @@ def stress_lines(found: StressResult) -> list[str]:
     """
     lines = [
         f"{counted(found.cases, 'case')} of {found.vut}, {len(found.failures)} of them "
-        f"failures, {found.runs} times each",
+        f"failures, ran {found.runs} times each",
         # The columns of the rows below: 8, 10, 10 and 12 characters wide.
         "   flips  now pass  now fail  no verdict  change",
     ]
