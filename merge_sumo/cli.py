@@ -42,6 +42,10 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
+SEARCH, LOOK, CHANGE, OWN, RESEARCH = map(
+    Group.create_ordered,
+    ("Find failures", "Inspect cases", "Compare versions", "Bring your own", "Research"),
+)
 OPTIONS = Group.create_ordered("Options")
 MORE = Group.create_ordered("More options")
 USED = """
@@ -81,10 +85,6 @@ FIELDS: Mapping[str, Parameter] = {
     "workers": Parameter(show_default=False),
 }
 """Other settings of an option, by the name of its field."""
-SEARCH, LOOK, CHANGE, OWN, RESEARCH = map(
-    Group.create_ordered,
-    ("Find failures", "Inspect cases", "Compare versions", "Bring your own", "Research"),
-)
 GONE: Mapping[str, str] = {
     "board": "`merge-sumo report` prints on A4, and `report --json` lists each fact and its source",
     "crosscheck": "`python tools/crosscheck.py RUN`, in a checkout, repeats cases in HighwayEnv",
@@ -168,7 +168,7 @@ app = Commands(
     """,
     version=lambda: f"merge-sumo {version('merge-sumo')}",
     version_flags="--version",
-    group_parameters=OPTIONS,
+    group_commands=MORE,
     default_parameter=Parameter(
         negative=(),
         name_transform=lambda name: c.flag_of(name).removeprefix("--"),
@@ -218,7 +218,8 @@ def campaign(
         Parameter(help="Continue the campaign in this folder. --cases may be larger."),
     ] = None,
     out: Annotated[
-        Path | None, Parameter(help="New folder to write. [default: runs/VUT-DATE]")
+        Path | None,
+        Parameter(metavar="FOLDER", help="New folder to write. [default: runs/VUT-DATE]"),
     ] = None,
     json: Json = False,
 ) -> int:
@@ -413,15 +414,15 @@ def simple(
 simple(c.Explain, "explain", LOOK)
 simple(c.Vuts, "vuts", OWN)
 simple(c.CheckVut, "check_vut", OWN, "check-vut")
-simple(c.NewScenario, "new_scenario", name="new", of=scenario)
-simple(c.CheckScenario, "check_scenario", name="check", of=scenario)
+simple(c.NewScenario, "new_scenario", OWN, "new", scenario)
+simple(c.CheckScenario, "check_scenario", OWN, "check", scenario)
 simple(c.Train, "train", OWN)
 simple(c.GroundTruth, "truth", RESEARCH)
 simple(c.Benchmark, "benchmark", RESEARCH)
 simple(c.Reproduce, "reproduce", RESEARCH)
 
 
-@command(c.Scenarios, name="list", of=scenario)
+@command(c.Scenarios, OWN, "list", scenario)
 def list_scenarios(*, json: Json = False) -> int:
     return print_result(ms.scenarios(), json)
 
