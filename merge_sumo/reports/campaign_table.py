@@ -64,7 +64,7 @@ def campaign_lines(run: RecordedCampaign, summary: Summary, facts: Sequence[Fact
         found.append("nothing tested")
     head = f"{of[VUT].shown} on {run.scenario.name}: {', '.join(found)}"
     rule = f"({of[RULE].shown})"
-    is_short = len(head) + len(rule) < 105  # else the rule is a line of its own
+    is_short = len(head) + len(rule) < 105  # else the rule has its own line
     lines = [f"{head} {rule}", ""] if is_short else [head, rule, ""]
     shares = {fact.level: fact.shown for fact in facts if fact.name == STARTS_THAT_FAIL}
     if summary.levels:

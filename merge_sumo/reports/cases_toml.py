@@ -136,7 +136,7 @@ def write_cases(run: RecordedCampaign, indices: Sequence[int], target: Path) -> 
 
     Args:
         run: the campaign.
-        indices: the cases; without any, those of `watching`.
+        indices: the cases; without any, the cases of `watching`.
         target: the new file, or a folder for it.
 
     Returns:
@@ -195,7 +195,7 @@ def _scenario(scenario: Scenario, path: Path) -> dict[str, Any]:
 
 
 def _line(run: RecordedCampaign, outcome: Outcome) -> str:
-    """Return the line of a case: verdict and deciding measures, its place, and its acceptance."""
+    """Return the line of a case: verdict, deciding measures, start, and reason of acceptance."""
     record = outcome.to_record() | {"margin": outcome.margin, "verdict": verdict_of(outcome)}
     if outcome.measures.end is End.MERGED:
         record["end"] = None

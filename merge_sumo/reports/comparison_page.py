@@ -62,7 +62,7 @@ def comparison_page(compared: Comparison) -> str:
 
 
 def _maps(shown: ShownCases) -> dict[tuple[int, int], Any]:
-    """Return by version and level the coordinates, and the marks, the first ones on top."""
+    """Return coordinates and marks by version and level, with the first marks on top."""
     maps: dict[tuple[int, int], Any] = {}
     for number, (version_change, one) in reversed(list(enumerate(shown))):
         case = one.earlier.case
@@ -73,7 +73,7 @@ def _maps(shown: ShownCases) -> dict[tuple[int, int], Any]:
 
 
 def _data(compared: Comparison, shown: ShownCases) -> dict[str, Any]:
-    """Return what the scripts draw: two entries of `cases` for each case shown."""
+    """Return the data of the scripts, with two entries of `cases` for each case shown."""
     scenario = shown[0][1].later.case.scenario
     road = road_or_shipped(scenario)
     road_lines = centre_lines(road)

@@ -85,9 +85,9 @@ def export_cases(
 
 
 def write_table(run: RecordedCampaign, indices: Sequence[int], target: Path) -> Path:
-    """Write the motion of cases, or of all, as one table with a row for each step.
+    """Write the motion of cases, or of all cases, as one table with a row for each step.
 
-    Its columns are time and motion of all vehicles, the case, its severity, and signals.
+    The columns are time and motion of all vehicles, the case, its severity, and signals.
 
     Args:
         run: the campaign.
@@ -116,7 +116,7 @@ def write_table(run: RecordedCampaign, indices: Sequence[int], target: Path) -> 
 
 
 def _rows(run: RecordedCampaign, index: int) -> Iterator[dict[str, Any]]:
-    """Yield the rows of a case by column; a text that begins as a formula gets a quote."""
+    """Yield the rows of a case by column; a text that begins like a formula gets a quote."""
     trajectory, scenario = run.trajectory(index), run.scenario
     merged = merged_rows(trajectory)
     starts = {one.field: one.of(trajectory.case) for one in coordinates(scenario)}
@@ -136,12 +136,12 @@ def _rows(run: RecordedCampaign, index: int) -> Iterator[dict[str, Any]]:
 
 
 def write_openscenario(run: RecordedCampaign, index: int, folder: Path, road: Road) -> Path:
-    """Write a case as an OpenDRIVE and two OpenSCENARIO files.
+    """Write a case as an OpenDRIVE file and two OpenSCENARIO files.
 
-    In the first all cars follow their recorded trajectories. In the second, `...-free.xosc`, the
-    VUT starts at its position and speed and has the controller that the parameter `EgoController`
-    names; the other cars follow their trajectories, then keep their last speed, until the timeout
-    of the scenario.
+    In the first OpenSCENARIO file all cars follow their recorded trajectories. In the second,
+    `...-free.xosc`, the parameter `EgoController` names the controller of the VUT, which starts at
+    its recorded position and speed. The other cars follow their trajectories, then keep their last
+    speed until the timeout of the scenario.
 
     A merge from an acceleration lane is a step of the trajectory of the VUT, from lane to lane. The
     reference point of a car is its front bumper, as in the record of SUMO.

@@ -169,7 +169,7 @@ def coverage_curves(title: str, study: SamplerStudy) -> Figure:
 def maps(title: str, panels: Mapping[str, Panel], level: int) -> Figure:
     """Draw cases and failures in the units of the pool, a panel per sampler.
 
-    With two coordinates the discs that FMC counts are drawn; with three, the first two coordinates.
+    With two coordinates, a panel has the discs that FMC counts. With three, it has the first two.
 
     Args:
         title: title of the figure.
@@ -408,7 +408,7 @@ def write_reproduction(result: Reproduction, folder: Path) -> Path:
 
 
 def _figures(result: Reproduction) -> Iterator[tuple[str, Figure]]:
-    """Yield name and figure of every picture; the template captions each by its name."""
+    """Yield name and figure of every picture; the name selects its caption in the template."""
     for one in result.columns.values():
         yield from figures_of(one)
     scale = result.scale

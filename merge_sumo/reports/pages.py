@@ -1,4 +1,4 @@
-"""Pages from templates: values are escaped, and a policy allows the style and script of a page."""
+"""Pages from templates: they escape values, and a policy allows only their style and script."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def page(
 
 
 def replace_page(path: Path, html: str) -> None:
-    """Write a page in the place of an older one.
+    """Write a page, in place of an older one.
 
     Args:
         path: file of the page.

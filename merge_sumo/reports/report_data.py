@@ -46,9 +46,9 @@ def page_data(model: ReportModel) -> dict[str, Any]:
         model: the content of the report.
 
     Returns:
-        `cases` has the columns of `_row`. `allCases` in report.js makes the table All cases of it,
-        with a column for each entry of `measures` that some case has. `speeds` is as `packed`
-        returns it.
+        `cases` has the columns of `_row`. From it, `allCases` in report.js makes the table All
+        cases, with a column for each entry of `measures` that some case has. `speeds` is the result
+        of `packed`.
     """
     scenario = model.run.scenario
     measures = []
@@ -76,7 +76,7 @@ def page_data(model: ReportModel) -> dict[str, Any]:
 
 
 def player_data(scenario: Scenario, road: Road) -> dict[str, Any]:
-    """Return what player.js reads apart from cases and speeds.
+    """Return the data of player.js apart from cases and speeds.
 
     Args:
         scenario: the scenario of the cases.
@@ -159,12 +159,12 @@ def _row(model: ReportModel, outcome: Outcome) -> dict[str, Any]:
 
 
 def _explanations(model: ReportModel) -> dict[int, dict[str, Any]]:
-    """Return by index the words on a failure, and its axes with a title each."""
+    """Return the changes that make failures pass, by index: in words, and as axes with titles."""
     found: dict[int, dict[str, Any]] = {}
     for known in model.explanations:
         case = model.run.outcome(known.index).case
         of_case = found.setdefault(known.index, {"words": [], "axes": []})
-        # Of another VUT in the same case.
+        # An explanation of another VUT in the same case.
         prefix = "" if known.vut is None else f"with {printable(known.vut)}: "
         for words in changes(known, case):
             of_case["words"].append(prefix + words)
@@ -205,10 +205,10 @@ def packed(motions: Iterable[Trajectory]) -> str:
 
 
 def _map(model: ReportModel, level: int) -> dict[str, Any]:
-    """Return the map of a level: its cases that are counted, and the failure probability.
+    """Return the map of a level: the counts of its further cases, and the failure probability.
 
-    A level with two coordinates has one map; with a third, the reader moves through it. With more,
-    a map shows the cases in a pair of coordinates, without a failure probability.
+    A level with two coordinates has one map. With three, a slider moves through the third. With
+    more, a map shows the cases in a pair of coordinates, without a failure probability.
     """
     dims, surface = len(model.axes[level]), model.surfaces[level]
     probability = _probability(surface, GRID[dims]) if surface and dims in GRID else None

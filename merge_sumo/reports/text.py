@@ -73,7 +73,7 @@ def change_in_words(case: ComparedCase) -> str:
         shares = f"{case.earlier_runs.in_words} -> {case.later_runs.in_words}"
         return f"{shares}, by Fisher's exact test p = {case.p_value:.2g}"
     words = [outcome_word(case.earlier), outcome_word(case.later)]
-    # Equal words do not show the change: add the margins where both may pass, else the verdicts.
+    # Equal words do not show the change: add the margins.
     is_weaker = case.change is Change.WEAKER
     if is_weaker or (words[0] == words[1] and case.change is not Change.BOTH):
         for place, outcome in enumerate((case.earlier, case.later)):
@@ -150,7 +150,7 @@ def comparison_lines(compared: Comparison) -> list[str]:
 
 
 def _too_small(truth: Truth) -> str:
-    """Return that a truth has too few cases, in a clause."""
+    """Return the reason why a truth is too small, in a clause."""
     return (
         "too small for shares and regions: doubling the number of its cases could add up to "
         f"{truth.growth:.0%} to its FMC"
@@ -195,7 +195,7 @@ def _cell(value: float | None, form: str) -> str:
 
 @lines_of.register
 def sampler_lines(study: SamplerStudy) -> list[str]:
-    """Return truth and limit, and a table of the samplers: medians [quartiles].
+    """Return the truth, the limit, and a table of the samplers: medians [quartiles].
 
     Args:
         study: the study.
@@ -451,7 +451,7 @@ def vut_check_lines(found: VutCheck) -> list[str]:
     for sentence in found.notes:
         lines.append(f"note: {sentence}")
     if found.us_per_step_median is not None:
-        lines.append(f"a step costs {found.us_per_step_median:.0f} us (median)")
+        lines.append(f"a step takes {found.us_per_step_median:.0f} us (median)")
     return lines
 
 
