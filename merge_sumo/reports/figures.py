@@ -191,7 +191,7 @@ def maps(title: str, panels: Mapping[str, Panel], level: int) -> Figure:
             axes.scatter(failing[:, 0], failing[:, 1], s=size, color=ink, **dots)
             _pool_axes(axes, US23.dimensions(level))
             axes.label_outer()
-            found = f"{len(failing)} of {len(panel.points)} cases fail, FMC {panel.fmc:.4f}"
+            found = f"{len(failing)} of {len(panel.points)} fail, FMC {panel.fmc:.4f}"
             axes.set_title(name, color=ink, fontweight="bold")
             axes.set_title(found, loc="right", fontsize=8.5)
     return figure
