@@ -252,7 +252,9 @@ def campaign(
 def run(
     vut: Annotated[
         str | None,
-        Parameter(help="Vehicle under test, as in `campaign`. Not necessary with --case."),
+        Parameter(
+            help="Vehicle under test, as in `campaign`. With --case, only for your own code."
+        ),
     ] = None,
     config: Options[c.CaseOptions] = c.CaseOptions(),
     *,
@@ -260,7 +262,7 @@ def run(
         list[str] | None,
         Parameter(
             consume_multiple=True,
-            help="Coordinates of the case by name, such as x_pov0_m=-250 v_pov0_mps=30.",
+            help="Values of the start by name, such as x_pov0_m=-250 v_pov0_mps=30.",
         ),
     ] = None,
     json: Json = False,
@@ -356,7 +358,7 @@ def rerun(
     stress: Annotated[
         bool,
         Parameter(
-            help="""Keep the VUT and change the simulation, to find robust failures.
+            help="""Run each case with small changes of the simulation, to find robust failures.
 
             A failure is robust if it fails with each change: a shorter step, an actuator with a
             lag, limited power, a start with the error of a sensor, and longer cars.""",

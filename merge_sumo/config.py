@@ -79,7 +79,7 @@ class Policies:
     """Drivers."""
 
     policies: AnyPath | None = None
-    """Folder of learned drivers, or a shipped library such as human.
+    """Folder of learned POV drivers, or a shipped library such as human.
 
     `merge-sumo train --out FOLDER` writes such a folder. By default it is the shipped library for
     the scenario, or else the one for us23.
@@ -115,7 +115,7 @@ class FailureRule:
     """What counts as a failure."""
 
     fail_when: str | None = None
-    """What counts as a failure: paper, contact, unsafe, or a condition over measures, such as
+    """Failure criterion: paper, contact, unsafe (contact or hard braking), or a condition such as
     'ttc_s < 1.5'. [default: as in the scenario]
 
     - paper: the front bumpers are within 6 m of each other when the VUT reaches the merge point M
@@ -138,7 +138,7 @@ class ScenarioChanges:
     """Settings that replace those of the scenario."""
 
     follow_up_s: float | None = None
-    """Seconds simulated after the merge. [default: 3, or 5 on a lane]
+    """Seconds simulated after the merge. [default: 3; acceleration lane: 5]
 
     With 0 an episode ends at the merge. The default is 3, and 5 on an acceleration lane.
     """
@@ -188,7 +188,7 @@ class Search:
     batch: int | None = None
     """Cases per batch. [default: chosen by the sampler]"""
     in_flight: int | None = None
-    """Number of cases that run or wait at a time, without batches.
+    """Keep this number of cases running or waiting, instead of batches.
 
     This suits controllers that take seconds for a case: the sampler proposes more cases while
     others run. About three times the number of workers is a good value.
@@ -204,7 +204,7 @@ class Search:
     seed: int = 0
     """Random seed. The same seed gives the same outcomes."""
     stop_when_converged: bool = False
-    """Stop before --cases if the search has converged.
+    """With --cases: stop earlier if the search has converged.
 
     It has converged when the last 100 cases have added less than 1 % to the coverage.
     """
@@ -258,7 +258,7 @@ class Levels:
     """Levels of the POV."""
 
     level: AnyLevels = "all"
-    """POV levels: 0, 1, 2 or own, or several with commas.
+    """POV levels, separated by commas: 0, 1, 2, or own (the driver of --pov).
 
     Level 0 ignores the VUT. Level 1 makes room for a VUT that accelerates. Level 2 expects a VUT
     that reacts. The level own is the driver of --pov.
@@ -270,7 +270,7 @@ class EngineChoice:
     """The engine that moves the vehicles."""
 
     engine: str | None = None
-    """Engine: kinematic or sumo. [default: kinematic, if the drivers allow]
+    """kinematic (equations of motion) or sumo. [default: first possible]
 
     The engine kinematic solves the equations of motion without SUMO, and repeats at least one case
     in a hundred in SUMO. It needs a VUT and a POV of this package. The engine sumo runs all cases
@@ -283,10 +283,10 @@ class Beginning:
     """The part of a case that is shown."""
 
     from_s: float | None = None
-    """First time to show, relative to the first conflict, such as -3.
+    """Time to begin, from the first contact or near miss, such as -3.
 
-    The first conflict is the contact. Without a contact it is the lowest time to collision or the
-    merge, and without a merge it is the end of the case.
+    Without a contact, the near miss is the lowest time to collision or the merge. Without a merge
+    it is the end of the case.
     """
 
 
@@ -298,12 +298,11 @@ class CampaignOptions(Execution, Junit, Test, Search, Levels):
     """Test a controller: run cases in SUMO, find failures, and write a report.
 
     The controller drives the vehicle under test (VUT). The primary other vehicle (POV) reacts to
-    it. The run folder also contains the worst failures as scenarios that `replay` can show. Ctrl-C
-    ends the campaign after the running batch and prints how to continue. A second Ctrl-C stops at
-    once.
+    it. The results are in a new run folder, and `replay` shows its cases in SUMO. Ctrl-C ends the
+    campaign after the running batch and prints how to continue. A second Ctrl-C stops at once.
 
-    Exit code: 0 if finished, 1 if a --gate is met or the VUT merged in no case, 2 for wrong usage,
-    130 or 143 if stopped.
+    Exit code: 0 if finished, 1 if an event occurred that --gate names, or if the VUT merged in no
+    case, 2 for wrong usage, 130 or 143 if stopped.
 
     Example:  merge-sumo campaign --vut design1 --level 0 --cases 400 --seed 1
 
@@ -317,7 +316,7 @@ class CampaignOptions(Execution, Junit, Test, Search, Levels):
     It can be of any kind except traci and traci:PORT, clients that connect by themselves.
     """
     gates: Iterable[str] = ()
-    """Exit with 1 for failures, errors, timeouts, regressions, or "fmc>X".
+    """Exit with 1 after failures, errors, timeouts, regressions, or "fmc>X".
 
     The option may be given several times. "fmc>X" is met if the FMC at some level is above X. The
     gate regressions needs --against.
@@ -368,7 +367,10 @@ class Resume(CampaignCalls):
     """
 
     run: AnyRun
-    """The campaign, or its folder."""
+    """Run folder of the campaign.
+
+    In Python, also the campaign itself.
+    """
     _: KW_ONLY
     vut: AnyVut | None = None
     """The VUT again, if it is your own code."""
@@ -396,9 +398,9 @@ class CaseOptions(Beginning, Test):
     svo_rad: float | None = None
     """Social value orientation of the POV at level 2: 0 is egoistic, pi/2 altruistic."""
     headway_ahead_s: float | None = None
-    """Time headway of the POV to the car ahead, in traffic."""
+    """Time headway from the POV to the car ahead, in traffic."""
     headway_behind_s: float | None = None
-    """Time headway of the car behind the POV, in traffic."""
+    """Time headway from the car behind to the POV, in traffic."""
     debug: bool = False
     """Run the VUT in this process without a deadline, for breakpoints."""
     gui: bool = False
@@ -424,7 +426,7 @@ class RunCase(CaseOptions):
     """A row of `run.cases` or `run.failures`: its level and coordinates are the defaults."""
     _: KW_ONLY
     at: Mapping[str, float] | None = None
-    """Coordinates of the case by their names in outcomes.jsonl."""
+    """Values of the start by their names in outcomes.jsonl."""
     on_end: Callable[[Any], None] | None = None
     """Function that is called with the result when the case has ended, before a window closes."""
 
@@ -434,9 +436,8 @@ class Probability(EngineChoice, StudyOptions):
     """Estimate the failure probability of a VUT, with a valid confidence interval.
 
     The cases of the campaign were chosen to fail, so their share of failures is not a probability.
-    They show where failures are expected. merge-sumo draws new cases from there and, separately,
-    from the rest of the pool. The interval is exact even if the expectation is wrong. Failures in
-    the rest are failures that the campaign has missed.
+    They show where failures are likely. merge-sumo draws new cases there and, separately, in the
+    rest of the pool of starts. The interval is valid even if the campaign has missed failures.
 
     Example:  merge-sumo probability runs/design2
 
@@ -444,12 +445,16 @@ class Probability(EngineChoice, StudyOptions):
     """
 
     run: AnyRun
-    """The campaign, or its folder."""
+    """Run folder of the campaign.
+
+    In Python, also the campaign itself.
+    """
     _: KW_ONLY
     cases: int | None = None
-    """Number of new cases. [default: 100000, or 4000 in SUMO]"""
+    """Number of new cases. [default: 100000; with --engine sumo: 4000]"""
     traffic: AnyPath | None = None
-    """Also estimate failures per merge in traffic: exid-2, exid-3, exid-5, or a TOML file.
+    """Also estimate failures per merge in traffic: exid-2, exid-3 or exid-5 (sites of the exiD
+    data set), or your own TOML file.
 
     The file contains the density and the speeds of the traffic.
     """
@@ -471,15 +476,18 @@ class Explain(StudyOptions):
     """Explain a failure: find the smallest change of one value that makes the case pass.
 
     merge-sumo changes one value at a time: a coordinate of the start, the level of the POV, or a
-    parameter of the controller. It runs the case with other values, and runs each printed value
-    twice. A campaign explains its worst failure automatically, without parameters, if the VUT is of
-    this package. `report` shows all explanations.
+    parameter of the controller. It tries other values, and confirms each printed value with a
+    second run. If the VUT is built in, a campaign explains its worst failure by itself, without
+    changing parameters. `report` shows all explanations.
 
     Example:  merge-sumo explain runs/design1
     """
 
     run: AnyRun
-    """The campaign, or its folder."""
+    """Run folder of the campaign.
+
+    In Python, also the campaign itself.
+    """
     case: int | None = None
     """Index of the failure in outcomes.jsonl. [default: the worst failure]"""
     _: KW_ONLY
@@ -495,7 +503,10 @@ class Export:
     """
 
     run: AnyRun
-    """The campaign, or its folder."""
+    """Run folder of the campaign.
+
+    In Python, also the campaign itself.
+    """
     indices: Indices | None = None
     """Indices of the cases. [default: all for csv, up to 40 for cases]
 
@@ -544,7 +555,10 @@ class Report:
     """
 
     run: AnyRun
-    """The campaign, or its folder."""
+    """Run folder of the campaign.
+
+    In Python, also the campaign itself.
+    """
 
 
 # Change
@@ -557,11 +571,11 @@ class Rerun(Page, Levels, StudyOptions):
     The cases are those that the campaign recorded. To search for cases that only the new version
     fails, use `campaign --against`.
 
-    A cases file of `export --format cases` can replace the campaign. Then the command prints the
-    changes compared with the file, and --out writes the updated file.
+    RUN can also be a cases file, which `export --format cases` writes. Then --out writes a new
+    cases file with the new results.
 
-    With a controller that is not built in, each changed case runs a second time. If the second
-    result differs, the case is "not repeatable" and does not count.
+    If your own controller changes the result of a case, the case runs once more. If that result
+    differs again, the case is "not repeatable" and does not count.
 
     Exit code: 0 if no case broke, 1 if a case broke, 2 for wrong usage. A case broke if it passed
     before and does not pass now. With a cases file the exit code is also 1 for a new error or
@@ -575,7 +589,10 @@ class Rerun(Page, Levels, StudyOptions):
     """
 
     run: AnyRun
-    """The campaign, its folder, or a cases file."""
+    """Run folder of the campaign, or a cases file.
+
+    In Python, also the campaign itself.
+    """
     indices: Indices = ()
     """Indices of the cases. [default: all cases]"""
 
@@ -588,7 +605,10 @@ class Stress(StudyOptions):
     """
 
     run: AnyRun
-    """The campaign, or its folder."""
+    """Run folder of the campaign.
+
+    In Python, also the campaign itself.
+    """
 
 
 @dataclass(frozen=True)
@@ -730,7 +750,7 @@ class GroundTruth(EngineChoice, Execution, Test):
     In Python also a class, a function or an object.
     """
     level: AnyLevels = "all"
-    """POV levels: 0, 1, 2 or own, or several with commas."""
+    """POV levels, separated by commas: 0, 1, 2, or own (the driver of --pov)."""
     _: KW_ONLY
     cases: int | None = None
     """Uniform cases per level. [default: 10000, or 20000 at level 2]"""
@@ -756,7 +776,7 @@ class Benchmark(Execution, Test):
     In Python also a class, a function or an object.
     """
     level: AnyLevels = "all"
-    """POV levels: 0, 1, 2 or own, or several with commas."""
+    """POV levels, separated by commas: 0, 1, 2, or own (the driver of --pov)."""
     _: KW_ONLY
     samplers: Names | None = None
     """Names of samplers, separated by commas. [default: all]"""
