@@ -117,7 +117,8 @@ def _remarks(
         measure = campaign_command("probability", run.folder, run.record)
         yield "Not known:", ["the share of all starts that fail; to measure it, run", measure]
     if AT_MOST in of:
-        yield "Converged:", [f"before {of[AT_MOST].shown} cases, as little new was found"]
+        limit = f"(limit: {of[AT_MOST].shown} cases)"
+        yield "Converged:", [f"the last 100 cases added less than 1 % to the FMC {limit}"]
     if AVOIDED_BY_POV in of:
         yield "Avoidable:", textwrap.wrap(_avoidable(of), 87)
     if WORST in of:
