@@ -6,10 +6,8 @@ from __future__ import annotations
 
 import json
 import random
-import re
 import sys
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 from support.packages import install
@@ -148,14 +146,6 @@ def test_a_batched_class_that_takes_no_number_of_corridors_is_told_of_it(write_v
     batched = "class Vut:\n    def act_batch(self, seen):\n        return seen.t_s\n"
     with pytest.raises(UserError, match="cannot be made: TypeError"):
         in_process(write_vut(batched)).open(2)
-
-
-def test_the_example_of_the_tutorial_drives(write_vut):
-    page = Path(__file__).parents[2] / "docs" / "tutorials" / "python-vut.md"
-    text = page.read_text(encoding="utf-8")
-    (source,) = re.findall(r"```python\n(class MyVut.*?)```", text, flags=re.DOTALL)
-    trajectories = run_cases(in_process(write_vut(source, "MyVut")), cases_of(20))
-    assert min(trajectory.a_vut_mps2.min() for trajectory in trajectories) == -2.0
 
 
 SEEDED = """

@@ -38,7 +38,9 @@ from merge_sumo.scenario.trajectory import End
 PAGE = (Path(__file__).parents[2] / "docs/tutorials/traci-controller.md").read_text(
     encoding="utf-8"
 )
-CONTROLLER, ON_A_LANE = re.findall(r"```python\n(import sys, traci.*?)```", PAGE, flags=re.DOTALL)
+CONTROLLER, ON_A_LANE = re.findall(
+    r"```python.*?\n(import sys, traci.*?)```", PAGE, flags=re.DOTALL
+)
 """The tutorial's controllers: one with the law of level 0, and one for an acceleration lane."""
 
 

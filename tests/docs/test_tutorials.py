@@ -6,7 +6,7 @@ import re
 import shlex
 
 import pytest
-from ci_snippets import PAGE, main
+from ci_snippets import PAGE, files, main
 from docs_pages import DOCS
 from support.calling import run_in_a_process
 
@@ -37,13 +37,21 @@ def test_the_start_page_leads_to_a_failing_case(tmp_path):
     assert changes in run_in_a_process(tmp_path, *rerun).out
 
 
-@pytest.mark.slow
-def test_the_first_campaign_prints_its_page(tmp_path):
-    page = blocks("tutorials/first-campaign.md")
+def test_readme_shows_the_first_campaign():
     table, timeline = blocks("../README.md")["text"]
-    assert table.replace("runs/first", "runs/first-campaign") == page["text"][0]
-    assert page["text"][1].startswith(timeline.replace("case:", "case 456:"))
-    for command, printed in zip(page["sh"], page["text"], strict=False):
+    first, case, *_ = blocks("tutorials/first-campaign.md")["text"]
+    assert table.replace("runs/first", "runs/first-campaign") == first
+    assert case.startswith(timeline.replace("case:", "case 456:"))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["first-campaign", "python-vut", "traci-controller"])
+def test_a_tutorial_prints_what_it_shows(tmp_path, name):
+    tutorial = f"tutorials/{name}.md"
+    page = blocks(tutorial)
+    for file, source in files((DOCS / tutorial).read_text("utf-8")).items():
+        (tmp_path / file).write_text(source)
+    for command, printed in zip(page.get("sh", page["bash"]), page["text"], strict=False):
         assert printed in run_in_a_process(tmp_path, *shlex.split(command)[1:]).out
 
 
