@@ -195,7 +195,9 @@ class CampaignRun(Result):
             UserError: the campaign has no such level, or matplotlib is not installed.
         """
         if level not in self.recorded.levels:
-            raise UserError(f"no level {level!r} in {self.folder}: it has {self.recorded.levels}")
+            raise UserError(
+                f"no level {level!r} in {self.folder}: choose from {self.recorded.levels}"
+            )
         at_level = [one for one in self.recorded.cases if one.case.level == level]
         return draw_map(at_level, self.recorded.scenario.dimensions(level), axes)
 

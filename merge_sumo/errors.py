@@ -36,7 +36,7 @@ def explained(clause: str) -> Iterator[None]:
     """Within `with`, put a clause in front of the sentence of a `UserError`.
 
     Args:
-        clause: what is wrong; the sentence says why.
+        clause: the problem; the sentence gives its cause.
     """
     try:
         yield

@@ -96,16 +96,16 @@ def check_new(path: Path, option: str = "`out`", endings: Sequence[str] = ()) ->
         endings: allowed endings of a file.
     """
     if endings and path.suffix not in endings:
-        raise UserError(f"{option} is {str(path)!r}: end it in {' or '.join(endings)}")
+        raise UserError(f"{option} is {str(path)!r}: its name must end in {' or '.join(endings)}")
     if path.name in ("", ".."):
-        raise UserError(f"{option} is {str(path)!r} or empty: write a name")
+        raise UserError(f"{option} is {str(path)!r} or empty: give a name")
     if os.path.lexists(path):
         raise _exists(path, option)
     try:
         with writing(path), suppress(FileNotFoundError):
             (path / LONG_NAME).lstat()
     except ValueError as error:
-        raise UserError(f"{option} is {str(path)!r}: no file can have that name") from error
+        raise UserError(f"{option} is {str(path)!r}: a file cannot have this name") from error
     parent = path.parent
     while not os.path.lexists(parent) and parent != parent.parent:
         parent = parent.parent
@@ -151,7 +151,9 @@ def check_generated(path: Path, mark: bytes = GENERATOR) -> None:
         except FileNotFoundError:
             return
     if content and mark not in content:
-        raise UserError(f"{path} was not created by merge-sumo and is not overwritten: move it")
+        raise UserError(
+            f"{path} was not created by merge-sumo and is not overwritten: move or rename it"
+        )
 
 
 def make_folder(path: Path, option: str = "`out`", *, exist_ok: bool = False) -> None:
@@ -398,8 +400,8 @@ def check_code(path: Path) -> None:
     """
     if why := _written_by_others(path, 0):
         raise UserError(
-            f"{printable(str(path))} is not run: {why}; make it yours alone (`chmod go-w "
-            f"{quoted(path)}`), or copy it"
+            f"{printable(str(path))} is not run: {why}; make it writable for you alone (`chmod "
+            f"go-w {quoted(path)}`), or copy it"
         )
 
 
@@ -414,8 +416,8 @@ def check_private(folder: Path) -> None:
     """
     if why := _written_by_others(folder):
         raise UserError(
-            f"the cache folder {folder} is not used: {why}, and could forge what it holds; run "
-            f"`chmod go-w {quoted(folder)}`, or name another one with {CACHE}"
+            f"the cache folder {folder} is not used: {why}, and could change its files; run "
+            f"`chmod go-w {quoted(folder)}`, or set {CACHE} to another folder"
         )
 
 

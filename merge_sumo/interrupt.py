@@ -50,7 +50,7 @@ class Interrupt:
         """Prepare to note signals.
 
         Args:
-            note: what is printed at the first signal.
+            note: text to print at the first signal.
         """
         self._note = f"\n{note}\n".encode()
         self._number: int | None = None

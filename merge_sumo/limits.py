@@ -11,14 +11,14 @@ ADDRESS_SPACE_GIB = 2.0
 """Below this SUMO, or the libraries of linear algebra, end the process without a word."""
 EXHAUSTED = {
     errno.EMFILE: "too many files are open: raise the limit (`ulimit -n`)",
-    errno.ENFILE: "too many files are open in the whole system: close some of its programs",
-    errno.EAGAIN: "the system starts no more processes or threads: raise the limit (`ulimit -u`)",
-    errno.ENOMEM: "the memory is full: take fewer `workers`, or raise the limit (`ulimit -v`)",
-    errno.EFBIG: "a file would be larger than the limit allows: raise it (`ulimit -f`)",
-    errno.ENOSPC: "the disk is full: make room, or take another folder with `out` and TMPDIR",
-    errno.EDQUOT: "the quota of the disk is used up: make room, or take another folder",
-    errno.EROFS: "the disk is read-only: take another folder with `out` and TMPDIR",
-    errno.EIO: "a disk or a terminal failed: try it again",
+    errno.ENFILE: "too many files are open in the whole system: close some programs",
+    errno.EAGAIN: "the system cannot start more processes: raise the limit (`ulimit -u`)",
+    errno.ENOMEM: "the memory is full: use fewer `workers`, or raise the limit (`ulimit -v`)",
+    errno.EFBIG: "a file would exceed the limit of its size: raise it (`ulimit -f`)",
+    errno.ENOSPC: "the disk is full: free space, or choose another folder with `out` and TMPDIR",
+    errno.EDQUOT: "the disk quota is used up: free space, or choose another folder",
+    errno.EROFS: "the disk is read-only: choose another folder with `out` and TMPDIR",
+    errno.EIO: "a disk or a terminal failed: try again",
 }
 """Advice where the system refuses more, by its error."""
 
@@ -31,8 +31,8 @@ def check_limits() -> None:
         most, _ = resource.getrlimit(resource.RLIMIT_AS)
         if most != resource.RLIM_INFINITY and most < ADDRESS_SPACE_GIB * 2**30:
             raise UserError(
-                f"the limit of address space (`ulimit -v`) is {most / 2**30:.2g} GiB: it takes "
-                f"{ADDRESS_SPACE_GIB:g} GiB or more"
+                f"the limit of address space (`ulimit -v`) is {most / 2**30:.2g} GiB: raise it "
+                f"to {ADDRESS_SPACE_GIB:g} GiB or more"
             )
 
 

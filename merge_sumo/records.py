@@ -94,7 +94,7 @@ def decode(content: bytes | str, kind: Any = Any) -> Any:
         record = None if kind is Any else decode(content)
         raise RecordError(_sentence(error, record, kind)) from error
     except RecursionError as error:
-        raise RecordError("it is nested too deeply") from error
+        raise RecordError("it has too many nested levels") from error
     except (msgspec.DecodeError, ValueError) as error:
         raise RecordError(f"it is not JSON ({error})") from error
 
@@ -115,7 +115,7 @@ def read_record(path: Path, kind: type[T]) -> T | None:
         return None
     except OSError as error:
         raise UserError(f"{path} cannot be read: {error.strerror}") from error
-    with explained(f"{path} is not as it was written"):
+    with explained(f"{path} is damaged"):
         known: T = decode(content, kind)
     return known
 
@@ -137,7 +137,7 @@ def convert(record: object, kind: type[T], *, strict: bool = True) -> T:
     except msgspec.ValidationError as error:
         raise RecordError(_sentence(error, record, kind)) from error
     except RecursionError as error:
-        raise RecordError("it is nested too deeply") from error
+        raise RecordError("it has too many nested levels") from error
 
 
 def _check_names(record: object, kind: Any) -> None:
@@ -194,12 +194,12 @@ def read_indexed(path: Path, kind: type[T], indices: Container[int]) -> list[T]:
         raise RecordError(f"{path} cannot be read: {error.strerror}") from error
     values: dict[Any, T] = {}
     for number, line in enumerate(lines, start=1):
-        with explained(f"line {number} of {path} is not as it was written"):
+        with explained(f"line {number} of {path} is damaged"):
             value: Any = convert(decode(line, dict[str, Any]), kind)
             # A case may have a line for each VUT.
             key = value.index, getattr(value, "vut", None)
             if value.index not in indices or key in values:
-                raise RecordError(f"it is of case {value.index}, of which no such line can be")
+                raise RecordError(f"case {value.index} does not exist or has a line already")
         values[key] = value
     return list(values.values())
 
@@ -220,7 +220,7 @@ def read_toml(path: Path, what: str) -> tuple[str, dict[str, Any]]:
     except OSError as error:
         raise UserError(f"cannot read the {what} {path}: {error.strerror}") from error
     except UnicodeDecodeError as error:
-        raise UserError(f"the {what} {path} is not a text in UTF-8") from error
+        raise UserError(f"the {what} {path} is not UTF-8 text") from error
     except (ValueError, RecursionError) as error:
         raise UserError(f"the {what} {path} is not TOML: {error}") from error
 
@@ -306,7 +306,7 @@ def _sentence(error: msgspec.ValidationError, record: Any, kind: Any) -> str:
         record = record.get(name) if isinstance(record, dict) else None
     wrong = _NAMED.match(message)
     if wrong and wrong[1] == "missing required":
-        return f"{name} has no {wrong[2]}"
+        return f"{name} has no field {wrong[2]}"
     if wrong:
         return _unknown(wrong[2], _class_of(kind))
     return _not_a_value(name, record, kind, message)

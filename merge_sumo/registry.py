@@ -81,12 +81,12 @@ class Registry(Mapping[str, T], Generic[T]):
         if len(bringers) > 1:
             packages = " and ".join(sorted(bringers))
             raise UserError(
-                f"{packages} bring a {self.noun} {name!r}: uninstall all but one of them"
+                f"{packages} each provide a {self.noun} {name!r}: keep one of them and uninstall "
+                "the others"
             )
         if not bringers:
             raise UserError(
-                f"there is no {self.noun} {name!r}: {meant(name, self)}choose one of "
-                f"{', '.join(self)}"
+                f"unknown {self.noun} {name!r}: {meant(name, self)}choose one of {', '.join(self)}"
             )
         ((package, entry),) = bringers.items()
         if not isinstance(entry, EntryPoint):

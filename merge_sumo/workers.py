@@ -273,15 +273,15 @@ def open_workers(workers: AnyWorkers = AUTO) -> Workers:
         workers: number, address, or "auto".
 
     Raises:
-        UserError: there is no cluster at the address, or the value is none of these.
+        UserError: no cluster answers at the address, or the value is of another kind.
     """
     if isinstance(workers, str) and workers != AUTO:
         return dask_workers(workers)
     count = number_of_workers(workers)
     if count > 1 and multiprocessing.current_process().daemon:
         notice(
-            "the cases run in this process, as a daemonic process, such as a worker of "
-            "multiprocessing.Pool, starts no others"
+            "the cases run in this process, because a daemonic process, such as a worker of "
+            "multiprocessing.Pool, cannot start others"
         )
         count = 1
     return Workers() if count == 1 else Workers(LocalProcesses, count)
@@ -298,7 +298,7 @@ def dask_workers(address: str) -> Workers:
     """
     if "://" not in address:
         raise UserError(
-            f"workers is {address!r}: give a number of processes, or the address of a Dask "
+            f"`workers` is {address!r}: give a number of processes, or the address of a Dask "
             "scheduler, tcp://HOST:PORT"
         )
     try:
@@ -306,7 +306,7 @@ def dask_workers(address: str) -> Workers:
         from distributed.client import ClosedClientError
     except ModuleNotFoundError as error:
         raise UserError(
-            f"workers at {address} need Dask: run `pip install merge-sumo[dask]`"
+            f"the workers at {address} need Dask: run `pip install merge-sumo[dask]`"
         ) from error
     with ExitStack() as opened:
         # A user reads one sentence of merge-sumo, and not the log of the library.
@@ -317,11 +317,13 @@ def dask_workers(address: str) -> Workers:
         try:
             client = Client(address, timeout=DASK_TIMEOUT_S, set_as_default=False)
         except (OSError, ValueError, TypeError, ImportError) as error:
-            raise UserError(f"there is no Dask scheduler at {address}: {error}") from error
+            raise UserError(f"no Dask scheduler answers at {address}: {error}") from error
         opened.callback(client.close)
         count = len(client.scheduler_info(n_workers=-1)["workers"])
         if count == 0:
-            raise UserError(f"the Dask scheduler at {address} has no workers: start `dask worker`")
+            raise UserError(
+                f"the Dask scheduler at {address} has no workers: start one with `dask worker`"
+            )
         workers = Workers(
             lambda _: client.get_executor(pure=False),
             count,

@@ -90,7 +90,7 @@ class CasesFile(RecordedCampaign):
     def _add(self, line: dict[str, Any]) -> None:
         """Add the case of a line; raise `UserError` where it is not a case."""
         if not all(math.isfinite(one) for one in line.values() if isinstance(one, float)):
-            raise UserError("it has a number that is not finite")
+            raise UserError("a number is not finite")
         verdict, accepted = line.pop("verdict", None), line.pop("accepted", None)
         merged = Measures(end=End.MERGED, t_end_s=0.0)
         whole: dict[str, Any] = {"level": None, "batch": 0}
@@ -101,13 +101,13 @@ class CasesFile(RecordedCampaign):
         outcome = Outcome.from_json(to_json(whole | line), self.scenario)
         judged = verdict_of(outcome)
         if verdict != judged or (outcome.margin is None) != (judged == "error"):
-            raise UserError(f"verdict is {verdict!r:.60}, but by margin and end it is {judged}")
+            raise UserError(f"verdict is {verdict!r:.60}, but its margin and end give {judged}")
         if outcome.index in self._by_index:
-            raise UserError("its index is there twice")
+            raise UserError("two cases have this index: remove one of them")
         self._by_index[outcome.index] = outcome
         if accepted is not None:
             if not (isinstance(accepted, str) and accepted.strip()):
-                raise UserError(f"accepted is {accepted!r:.60}: it must be a reason")
+                raise UserError(f"accepted is {accepted!r:.60}: it must be a text with the reason")
             self.accepted[outcome.index] = accepted
 
     def outcome(self, index: int) -> Outcome:

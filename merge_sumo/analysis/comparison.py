@@ -362,7 +362,7 @@ def compare(runs: Sequence[RecordedCampaign]) -> Comparison:
             and where they differ in the scenario, the criterion or, at a level, the POV.
     """
     if len(runs) < 2:
-        raise UserError("a comparison needs two campaigns or more: name the older one first")
+        raise UserError("a comparison needs at least two campaigns: name them, the oldest first")
     for run in runs[1:]:
         _check_comparable(runs[0], run)
     versions = list(map(Version.of, runs))
@@ -382,8 +382,8 @@ def compare(runs: Sequence[RecordedCampaign]) -> Comparison:
         versions=tuple(versions),
         version_changes=tuple(changes),
         source=(
-            "each campaign has the cases of its own search; `merge-sumo rerun` pairs the cases of "
-            "one with another VUT"
+            "each campaign searched for its own cases; to run the same cases with both versions, "
+            "use `merge-sumo rerun`"
         ),
         notes=tuple(notes),
     )
@@ -404,7 +404,7 @@ def compare_against(run: RecordedCampaign) -> Comparison | None:
     # An interrupted campaign may have more cases of the earlier version.
     outcomes = recorded.outcomes[: len(run.outcomes)]
     earlier = replace(Version.of(recorded), outcomes=outcomes, tolerated=run.tolerated)
-    source = f"both ran the same cases, which the search chose where {run.vut} alone may fail"
+    source = f"both versions ran the same cases, chosen where only {run.vut} may fail"
     return of_two(earlier, Version.of(run), source)
 
 
@@ -423,7 +423,7 @@ def _check_comparable(a: RecordedCampaign, b: RecordedCampaign) -> None:
     differs = {
         "the scenario": a.scenario != b.scenario,
         "what counts as a failure": a.criterion != b.criterion,
-        "the share of its runs in which a case may fail": a.tolerated != b.tolerated,
+        "the tolerated share of failing runs": a.tolerated != b.tolerated,
     }
     for level in sorted({*a.levels} & {*b.levels}):
         name = f"the POV of level {level_name(level)}"
@@ -431,7 +431,7 @@ def _check_comparable(a: RecordedCampaign, b: RecordedCampaign) -> None:
     for name, is_different in differs.items():
         if is_different:
             raise UserError(
-                f"{a.folder} and {b.folder} differ in {name}: compare campaigns that have the same"
+                f"{a.folder} and {b.folder} differ in {name}: choose campaigns that agree in it"
             )
 
 

@@ -182,9 +182,9 @@ def _latest_takeovers_s(
 def _avoided(
     plan: SimulationPlan, simulator: Simulator, cases: Sequence[Counterfactual]
 ) -> list[bool]:
-    """Run counterfactuals in the simulation of a simulator; return whether each is no failure.
+    """Run counterfactuals in the simulation of a simulator; return which of them avoid the failure.
 
-    That asks more than `Outcome.passes`: the vehicle behind must also be able to brake after the
+    This is stricter than `Outcome.passes`: the vehicle behind must also be able to brake after the
     merge.
     """
     simulation = simulator.simulation
@@ -216,7 +216,7 @@ class _Substitutes(Driver):
 
     def begin(self, corridor: int, case: Case) -> None:
         super().begin(corridor, case)
-        assert isinstance(case, Counterfactual), "only counterfactuals run here"  # noqa: S101
+        assert isinstance(case, Counterfactual), "this code runs counterfactuals only"  # noqa: S101
         self._by[corridor] = list(self._drivers).index(case.by)
         self._until[corridor] = case.until
         recorded = case.failure.a_vut_mps2[: case.scenario.max_steps + 1]

@@ -158,10 +158,10 @@ def failure_of(run: RecordedCampaign, index: int | None) -> Outcome:
     """
     worst = failures(run.cases)
     if index is None and not worst:
-        raise UserError(f"{run.folder} has no failure: nothing can be explained")
+        raise UserError(f"{run.folder} has no failure to explain")
     outcome = worst[0] if index is None else run.outcome(index)
     if not outcome.failed:
-        raise UserError(f"case {index} did not fail: name a failure")
+        raise UserError(f"case {index} did not fail: choose a case that failed")
     return outcome
 
 
@@ -256,8 +256,8 @@ class _Search:
     def _confirm(self, plan: SimulationPlan) -> None:
         if self._passes(plan, self._reported) != list(self._reported.values()):
             raise UserError(
-                f"case {self._index} ends otherwise when it runs again: the VUT is not that of the "
-                "campaign, or does not repeat itself, and nothing can be said of its changes"
+                f"case {self._index} ended differently when it ran again: the VUT has changed "
+                "since the campaign, or is not repeatable"
             )
 
     def _searched(self, axis: Axis, trial: Callable[[str, float], Trial]) -> Axis:

@@ -30,9 +30,9 @@ from merge_sumo.scenario.scenario import Coordinate, Scenario
 
 Weight = Annotated[float, Meta(ge=0.0)]
 Weights = Annotated[
-    tuple[Weight, ...], Meta(min_length=1, description="weights, numbers of 0 or more")
+    tuple[Weight, ...], Meta(min_length=1, description="a list of weights, each 0 or more")
 ]
-ByLevel = Annotated[dict[str, Weight], Meta(description="weights, numbers of 0 or more, by level")]
+ByLevel = Annotated[dict[str, Weight], Meta(description="weights by level, each 0 or more")]
 LEAST_INSIDE = 1e-9
 """Minimum share of a distribution within the pool: with less its quantiles are not numbers."""
 
@@ -89,14 +89,12 @@ class _Shape(Record, frozen=True):
         high = coordinate.high if self.high is None else self.high
         if not coordinate.low <= low < high <= coordinate.high:
             raise UserError(
-                f"{coordinate.field}: low is {low:g} and high {high:g}: choose low < high within "
-                f"the pool, {coordinate.low:g} to {coordinate.high:g}"
+                f"{coordinate.field}: low is {low:g} and high is {high:g}: choose low < high "
+                f"within the pool, {coordinate.low:g} to {coordinate.high:g}"
             )
         below, up_to = self.ends(low, high)
         if not up_to - below > LEAST_INSIDE:
-            raise UserError(
-                f"{coordinate.field}: such a distribution has no values within the pool"
-            )
+            raise UserError(f"{coordinate.field}: the distribution has no values within the pool")
         return low, high, below, up_to
 
 
@@ -162,9 +160,9 @@ class Histogram(_Shape, frozen=True, kw_only=True, tag_field="kind", tag="histog
         if len(edges) != len(weights) + 1:
             raise UserError(f"{len(weights)} weights need {len(weights) + 1} edges")
         if not ((np.diff(edges) > 0.0).all() and np.isfinite(edges).all()):
-            raise UserError("edges must rise, and be finite")
+            raise UserError("edges must be finite and in rising order")
         if not 0.0 < sum(weights) < math.inf:
-            raise UserError("weights must be not all 0, and finite")
+            raise UserError("weights must be finite, and one of them above 0")
         return rv_histogram((np.array(weights), edges), density=False)
 
 
@@ -245,10 +243,10 @@ def read_distribution(
         weights = content.levels or even
         if not weights.keys() <= even.keys():
             known = ", ".join(sorted(even))
-            raise UserError(f"levels must give weights to levels of the campaign: {known}")
+            raise UserError(f"the campaign does not have all of these levels: choose from {known}")
         total = sum(weights.values())
         if not 0.0 < total < math.inf:
-            raise UserError("levels must have weights that are not all 0, and a finite sum")
+            raise UserError("levels must have finite weights, and one of them above 0")
     shares = {int(level): weight / total for level, weight in weights.items() if weight > 0.0}
     return Distribution(shares, marginals, scenario)
 
@@ -273,7 +271,7 @@ class Traffic(Record, frozen=True):
         name: name of its file.
     """
 
-    source: Annotated[str, Meta(min_length=1, description="a text: where the figures are from")]
+    source: Annotated[str, Meta(min_length=1, description="a text: the source of the figures")]
     speeds: Normal | Histogram
     density_veh_per_km: Annotated[float, Meta(gt=0.0, le=1000.0)]
     name: str = ""
@@ -290,15 +288,15 @@ class Traffic(Record, frozen=True):
         """
         if scenario.vehicles > 2:
             raise UserError(
-                f"{scenario.name} has cars ahead of the POV and behind it, at headways of its own: "
-                "a traffic needs a scenario without them"
+                f"{scenario.name} has its own cars ahead of the POV and behind it: use a traffic "
+                "with a scenario that has none"
             )
         low, high = scenario.v_pov0_mps
         below, up_to = self.speeds.ends(low, high)
         if up_to - below < LEAST_SPEEDS:
             raise UserError(
-                f"less than {LEAST_SPEEDS:.0%} of the speeds of {self.name} lie in the pool, "
-                f"{low:g} to {high:g} m/s: run the campaign on a scenario with other v_pov0_mps"
+                f"less than {LEAST_SPEEDS:.0%} of the speeds of {self.name} are within the pool, "
+                f"{low:g} to {high:g} m/s: run a campaign on a scenario with another v_pov0_mps"
             )
         return up_to - below
 
@@ -339,7 +337,7 @@ def named_traffic(name: str) -> Traffic:
     path = shipped.get(name, Path(name))
     if path.suffix != SUFFIX:
         raise UserError(
-            f"there is no traffic {name!r}: choose {', '.join(shipped)}, or a file NAME{SUFFIX}"
+            f"unknown traffic {name!r}: choose {', '.join(shipped)}, or a file NAME{SUFFIX}"
         )
     _, record = read_toml(path, "traffic")
     with explained(str(path)):

@@ -60,7 +60,7 @@ def write_scenario(options: config.NewScenario) -> Shown:
     relative = os.path.relpath(net.resolve(), file.parent.resolve())
     write_new(picture, road_svg(road, scenario), "FILE")
     write_new(file, to_toml(replace(scenario, net=relative), found).encode(), "FILE")
-    lines = [*found, f"written: {file}, and its picture {picture}"]
+    lines = [*found, f"wrote {file} and its picture {picture}"]
     return Shown({"about": found, "written": [str(file), str(picture)]}, lines)
 
 
@@ -78,13 +78,14 @@ def check_scenario(scenario: Scenario, name: str, policies: Path | None) -> Show
     if differing:
         made = quoted(f"{scenario.name}-policies")
         lines += [
-            "the learned drivers (levels 1 and 2) were trained elsewhere; here they extrapolate:",
+            "the learned drivers (levels 1 and 2) were trained elsewhere, so they extrapolate "
+            "here:",
             *(f"  {sentence}" for sentence in differing),
             f"train them: merge-sumo train --scenario {quoted(name)} --out {made}",
-            f"then name it to campaigns with `policies`: {made}",
+            f"then use them in campaigns with `policies`: {made}",
         ]
     else:
         lines.append(
-            "the learned drivers (levels 1 and 2) were trained on such starts, or like ones"
+            "the learned drivers (levels 1 and 2) were trained on these starts or similar ones"
         )
     return Shown({"about": sentences, "unseen": differing}, lines)

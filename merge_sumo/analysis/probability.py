@@ -235,9 +235,9 @@ def failure_probability(
     cases = DEFAULT_CASES[study.plan.engine] if options.cases is None else options.cases
     check_least(options, cases=1, seed=0)
     if not 0.5 <= options.confidence < 1.0:
-        raise UserError(f"`confidence` is {options.confidence}: choose 0.5 or more, and below 1")
+        raise UserError(f"`confidence` is {options.confidence}: choose 0.5 to below 1")
     if options.distribution is not None and options.traffic is not None:
-        raise UserError("choose a distribution or a traffic: a traffic states its own")
+        raise UserError("`distribution` and `traffic` cannot be combined: choose one of them")
     check_new(out, endings=(".json",))
     study.check_same_system()
     traffic, distribution = None, read_distribution(options.distribution, levels, scenario)

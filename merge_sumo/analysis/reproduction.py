@@ -78,7 +78,7 @@ class Scale:
         seeds: number of searches of each sampler.
         truth_cases: number of uniform cases of the truth at levels 0, 1 and 2.
         batches: number of batches of every search, k.
-        batch: number of cases of a batch at one level, n; twice as many where all levels run.
+        batch: number of cases of a batch at one level, n; doubled where all levels run.
     """
 
     seeds: int = 10

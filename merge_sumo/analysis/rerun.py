@@ -61,7 +61,7 @@ def chosen(
             )
     found = [outcome for outcome in outcomes if level_name(outcome.case.level) in names]
     if not found:
-        raise UserError(f"{run.folder} has none of these cases: name others, or another level")
+        raise UserError(f"{run.folder} has none of these cases at this level: choose others")
     return found
 
 
@@ -92,8 +92,8 @@ def rerun(study: RunStudy, recorded: Sequence[Outcome]) -> Comparison:
     earlier = replace(Version.of(run), outcomes=recorded)
     later = replace(earlier, vut=settings.vut, folder=None, outcomes=outcomes, motion=motions.get)
     source = (
-        f"the cases come from the recorded search of {run.vut}; a campaign with `against` searches "
-        "for cases that only the new version fails"
+        f"the cases come from the search with {run.vut}; to search for cases that only the new "
+        "version fails, run a campaign with `against`"
     )
     compared = of_two(earlier, later, source)
     (version_change,) = compared.version_changes
@@ -108,9 +108,9 @@ def rerun(study: RunStudy, recorded: Sequence[Outcome]) -> Comparison:
     if number := version_change.count(Change.NOT_REPEATABLE):
         version_change = with_shares(version_change, recorded, outcomes)
         notes.append(
-            f"Not counted one by one, as it may be chance: {counted(number, 'change')}. Draw "
-            "random numbers from the seed of the case, as `reset(seen, seed)` tells it in Python, "
-            "or compare campaigns of both versions with `repeat`"
+            f"{counted(number, 'change')} may be chance and did not count. Draw random numbers "
+            "from the seed of the case (in Python: `reset(seen, seed)`), or compare campaigns of "
+            "both versions with `repeat`"
         )
     return replace(compared, version_changes=(version_change,), notes=tuple(notes))
 

@@ -188,13 +188,13 @@ class RunStudy:
         run, road, now = self.run, self.plan.road, self.settings.to_record(self.plan)
         if run.settings.net_sha256 not in (None, road.sha256):
             raise UserError(
-                f"{run.folder} was run on another net than {road.path} is now: put that back"
+                f"{road.path} is not the net on which {run.folder} ran: restore that net"
             )
         for level in self.settings.levels:
             if not same_pov(run.record, now, level):
                 raise UserError(
-                    f"{run.folder} was run against another POV of level {level_name(level)} than "
-                    "today's: give its `policies`, or the same `pov`"
+                    f"{run.folder} ran against another POV of level {level_name(level)}: set "
+                    "`policies` or `pov` as in that campaign"
                 )
         if not may_change:
             notice_changes(run, self.plan)
@@ -217,6 +217,6 @@ def notice_changes(run: RecordedCampaign, plan: SimulationPlan) -> None:
         changed = [file for file, sha256 in known.items() if now[file] != sha256]
         if changed:
             notice(
-                f"{printable(changed[0])} is not as it was in {run.folder}: {controller.spec} may "
-                "drive otherwise than it did there"
+                f"{printable(changed[0])} has changed since {run.folder}: {controller.spec} may "
+                "drive differently now"
             )

@@ -108,7 +108,7 @@ def search(
 
 
 def _lost_search(task: Task) -> SamplerRun:
-    raise UserError(f"the search of {task[0]} with seed {task[1]} ended its process each time")
+    raise UserError(f"the process of the search of {task[0]} with seed {task[1]} ended each time")
 
 
 def names_of(options: config.Benchmark) -> list[str]:
@@ -196,8 +196,8 @@ class Study:
             by_level[level] = self.truth(level, options.cases, options.seed)
         if not self.plan.vut.files_are_known and not is_in_process(settings.vut):
             notice(
-                "merge-sumo does not know which files the program of this VUT loads; this truth is "
-                "kept for its command and the files that are named there"
+                "merge-sumo cannot tell which files the program of this VUT loads: it reuses this "
+                "truth until the command or a file named in it changes"
             )
         return TruthResult(settings.vut, by_level, settings.criterion, settings.scenario)
 

@@ -160,7 +160,7 @@ def _with_actuator(plan: SimulationPlan, **values: float) -> SimulationPlan:
     act = plan.scenario.act
     for name in values:
         if getattr(act, name) not in (0.0, None):
-            raise UserError(f"the scenario has {name} of its own")
+            raise UserError(f"the scenario already sets {name}")
     return _changed(plan, act=replace(act, **values))
 
 
@@ -183,10 +183,10 @@ def _start_off(case: Case, rng: np.random.Generator) -> Case:
 
 UNCHANGED = "nothing"
 RUNGS = (
-    Disturbance(UNCHANGED, "nothing is changed"),
+    Disturbance(UNCHANGED, "no change"),
     Disturbance(
         "step",
-        f"a step of {PART_S:g} s, with a command held for {DT_S:g} s",
+        f"a step of {PART_S:g} s; each command lasts {DT_S:g} s",
         plan=lambda plan: replace(plan, substeps=round(DT_S / PART_S)),
     ),
     *(
@@ -199,12 +199,12 @@ RUNGS = (
     ),
     Disturbance(
         "power",
-        f"the VUT has {POWER_W_PER_KG:g} W/kg: it accelerates by P / (m v) at most",
+        f"the VUT has {POWER_W_PER_KG:g} W/kg, so it accelerates by at most P / (m v)",
         partial(_with_actuator, power_w_per_kg=POWER_W_PER_KG),
     ),
     Disturbance(
         "start",
-        f"the POV starts within {ERROR_X_M:g} m and {ERROR_V_MPS:.2f} m/s of where it did",
+        f"the POV starts within {ERROR_X_M:g} m and {ERROR_V_MPS:.2f} m/s of the recorded start",
         case=_start_off,
     ),
     Disturbance(
@@ -233,7 +233,7 @@ def stress(study: RunStudy) -> StressResult:
     run = study.run
     tested = [outcome for outcome in run.cases if outcome.is_tested]
     if not tested:
-        raise UserError(f"{run.folder} has no case with a verdict: nothing can be stressed")
+        raise UserError(f"{run.folder} has no case with a verdict, so there is nothing to stress")
     rungs = [_rung(study, tested, one) for one in RUNGS]
     failing = [outcome.index for outcome in failures(tested)]
     found = StressResult(len(tested), tuple(failing), tuple(rungs), run.vut)

@@ -67,7 +67,7 @@ def learn_surface(
         return None
     with threadpool_limits(1):
         predict = learn_chance(history)
-    assert predict is not None, "there are cases enough"  # noqa: S101
+    assert predict is not None, "there are enough cases"  # noqa: S101
 
     def chance(points: FloatArray) -> FloatArray:
         parts = np.array_split(points, len(points) // PART + 1)

@@ -89,7 +89,7 @@ def check_vut(settings: CampaignSettings) -> VutCheck:
             problems, notes = _checked(simulator, plan)
             cost_us = timed.us_per_step
     except ControllerError as error:
-        problems.append(f"It does not start: {error}")
+        problems.append(f"The VUT does not start: {error}")
     return VutCheck(
         vut=settings.vut,
         problems=problems,
@@ -147,16 +147,16 @@ def _memory_faults(
     """Return a sentence on the first motion that changes when the same cases run again, if any."""
     for corridor in range(simulator.simulation.corridors):
         simulator.vut.begin(corridor, from_standstill)  # one more reset
-    # Without the last case each one runs beside others than before.
+    # Without the last case, each case runs next to other cases than before.
     backwards = simulator.run(cases[-2::-1])
     for one, other in zip(driven[:-1], backwards[::-1], strict=True):
         from_s = difference(one, other)
         if from_s is not None:
             return [
-                "When the same cases run again in another order, it drives differently from "
-                f"t = {from_s:g} s on: it draws random numbers, reads a clock, mixes the corridors "
-                "of `act_batch`, or keeps something from earlier episodes, in its object (which "
-                "attributes does `reset` not clear?), its class or its module."
+                f"The VUT drives differently from t = {from_s:g} s on when the same cases run in "
+                "another order. Possible causes: it draws random numbers, reads a clock, mixes "
+                "the corridors of `act_batch`, or keeps values of earlier episodes in its object "
+                "(does `reset` clear each attribute?), class or module."
             ]
     return []
 
@@ -165,14 +165,14 @@ def _standstill_faults(simulator: Simulator, from_standstill: Case) -> list[str]
     """Return a sentence on a VUT that does not drive off, if it does not."""
     (driven,) = simulator.run([from_standstill])
     if driven.end.is_error:
-        return [f"From standstill it ends as VUT_ERROR at t = {driven.t_end_s} s: {driven.error}"]
+        return [f"From standstill: VUT_ERROR at t = {driven.t_end_s} s: {driven.error}"]
     if driven.end is End.TIMEOUT and not driven.v_vut_mps.any():
-        return ["From standstill it never starts, although the road is free at last."]
+        return ["From standstill the VUT never starts, although the road becomes free."]
     return []
 
 
 def _notes(plan: SimulationPlan, driven: Sequence[Trajectory]) -> list[str]:
-    """Return sentences on behaviour that is no fault, but may surprise the author of the VUT."""
+    """Return sentences on behaviour that is allowed, but may surprise the author of the VUT."""
     in_vain: Counter[str] = Counter()
     for trajectory in driven:
         in_vain.update(trajectory.in_vain)

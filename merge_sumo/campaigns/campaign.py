@@ -170,7 +170,7 @@ def _reopened(
     journal, run, dropped = Journal.reopen(folder)
     opened.enter_context(journal)
     if dropped:
-        notice(f"{folder}: dropped {dropped} outcomes of a batch that was stopped; it runs again")
+        notice(f"{folder}: dropped {dropped} outcomes of an interrupted batch, which runs again")
     journal.settings = _continued(settings, plan, run)
     return journal, run
 
@@ -197,10 +197,10 @@ def _continued(
     if ended or run.settings.cases < settings.cases:
         recorded |= {"cases": settings.cases, "stop_when_converged": settings.stop_when_converged}
     for name, (was, now) in differences(recorded, record).items():
-        same = f"give {was} or more" if name == "cases" else "make it the same"
+        same = f"give {was} or more" if name == "cases" else "set it as before"
         raise UserError(
-            f"{name} differs: {run.folder} was run with {was}, now it is {now}; {same}, or "
-            "start a new campaign"
+            f"{name} differs: {run.folder} ran with {was}, now it is {now}; {same}, or start a "
+            "new campaign"
         )
     return record
 

@@ -69,7 +69,7 @@ def named_settings(
             named["scenario"] = scenario_from(base, changes)
         elif changes:
             (name, *_) = changes
-            raise UserError(f"`{name}` is of the scenario: name that, too, with `scenario`")
+            raise UserError(f"`{name}` changes a scenario: set `scenario`, too")
     if isinstance(config, c.CampaignCalls):
         named |= c.non_defaults(config, c.Search)
         if config.cases is not None:
@@ -128,7 +128,7 @@ def planned_case(config: c.RunCase, run: RecordedCampaign | None) -> tuple[Campa
         UserError: no VUT is named, or the case is not one of the scenario.
     """
     if run is None and not config.vut:
-        raise UserError("say with `vut` who drives, or with `recorded` which case of a campaign")
+        raise UserError("no VUT is named: set `vut`, or choose a recorded case with `recorded`")
     named = named_settings(config, US23 if run is None else None)
     if run is None or config.recorded is None:
         scenario, row = named["scenario"], config.case or {}
@@ -159,8 +159,8 @@ def _case(scenario: Scenario, level: int, values: Mapping[str, Any]) -> Case:
         known.add(dimension.field)
         if values.get(dimension.field) is None:
             raise UserError(
-                f"`{dimension.field}` is missing: name it, or give it by `at`; the pool has "
-                f"{dimension.low:g} to {dimension.high:g}"
+                f"`{dimension.field}` is missing: set it, or give it in `at`; the pool ranges "
+                f"from {dimension.low:g} to {dimension.high:g}"
             )
     numbers: dict[str, Any] = {}
     if isinstance(scenario.v_vut0_mps, float):
@@ -168,8 +168,8 @@ def _case(scenario: Scenario, level: int, values: Mapping[str, Any]) -> Case:
     for name, value in values.items():
         if name not in known:
             raise UserError(
-                f"`{name}` is not a coordinate of {scenario.name} at level "
-                f"{level_name(level)}: leave it out, or name {either(sorted(known))}"
+                f"`{name}` is not a coordinate of {scenario.name} at level {level_name(level)}: "
+                f"remove it, or use {either(sorted(known))}"
             )
         if value is not None:
             numbers[name] = _number(name, value)

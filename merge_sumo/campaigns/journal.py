@@ -167,7 +167,7 @@ class Journal:
                     raise
         except UserError as error:
             resume = campaign_command("resume", self.folder, self.settings)
-            raise UserError(f"{error}; when it can be written, continue with `{resume}`") from error
+            raise UserError(f"{error}; when it is writable, continue with `{resume}`") from error
         before = dict(self.settings)
         for episode in episodes:
             self._note(episode)
@@ -229,7 +229,7 @@ def _lock(outcomes: io.FileIO, folder: Path) -> None:
         fcntl.flock(outcomes, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError as error:
         outcomes.close()
-        raise UserError(f"another process writes {folder}: wait until it has ended") from error
+        raise UserError(f"another process is writing {folder}: wait until it ends") from error
 
 
 def _write_all(file: io.FileIO, content: bytes) -> None:

@@ -145,8 +145,8 @@ class RecordedCampaign:
             needs_margin = not (self.criterion.is_of_paper or outcome.measures.end.is_error)
             if needs_margin == outcome.is_by_score and not self.criterion.uses_score:
                 raise UserError(
-                    f"case {outcome.index} in {path} is not judged by the criterion of {SETTINGS}, "
-                    f"{self.criterion.as_written}"
+                    f"the margin of case {outcome.index} in {path} does not follow the criterion "
+                    f"in {SETTINGS}, {self.criterion.as_written}"
                 )
 
     @property
@@ -186,15 +186,15 @@ class RecordedCampaign:
         fewer = len(self.outcomes) < self.settings.cases and not self.settings.stop_when_converged
         if not (self.torn or fewer):
             return ""
-        torn = f"; the last line of {OUTCOMES} is torn, and its case left out" if self.torn else ""
-        return f"This campaign was interrupted; the results are those of the finished cases{torn}."
+        torn = f"; the last line of {OUTCOMES} is incomplete and not counted" if self.torn else ""
+        return f"This campaign was interrupted; the results cover the finished cases{torn}."
 
     @property
     def ran_again_in_words(self) -> str:
         """A sentence on the number of cases that ran again."""
         return (
-            f"{counted(self.settings.ran_again, 'case')} ran again, because a process was "
-            "killed or stopped; the outcome is that of the last time."
+            f"{counted(self.settings.ran_again, 'case')} ran again after a process was killed or "
+            "stopped; the recorded outcome is the last one."
         )
 
     def outcome(self, index: int) -> Outcome:
@@ -275,7 +275,7 @@ class RecordedCampaign:
         cases = [outcome.case for outcome in self.outcomes]
         if [outcome.case for outcome in earlier.outcomes[: len(cases)]] != cases:
             raise UserError(
-                f"{earlier.folder} does not have the cases of {self.folder}: take both from a "
+                f"{earlier.folder} and {self.folder} have different cases: restore both from a "
                 "copy, or run the campaign again"
             )
         return earlier
@@ -311,9 +311,7 @@ class RecordedCampaign:
                     self._signals |= _signals_by_case(arrays["signals"], motion)
                 self._batches[batch] = motion
             except (KeyError, ValueError, TypeError, UserError) as error:
-                raise UserError(
-                    f"{path} is not as it was written: {error}; take it from a copy"
-                ) from error
+                raise UserError(f"{path} is damaged: {error}; restore it from a copy") from error
         return self._batches[batch]
 
 
@@ -463,8 +461,8 @@ def _reading(folder: Path) -> Iterator[None]:
         yield
     except OSError as error:
         raise UserError(
-            f"{folder} is not a campaign: cannot read {error.filename} ({error.strerror}); name a "
-            "folder that `merge-sumo campaign` has written"
+            f"{folder} is not a run folder: cannot read {error.filename} ({error.strerror}); name "
+            "a folder that `merge-sumo campaign` wrote"
         ) from error
 
 
@@ -480,7 +478,7 @@ def _motion_by_case(vehicles: int, arrays: Mapping[str, NDArray[Any]]) -> dict[i
         raise ValueError("the motion has numbers that are too large or not finite")
     within = rows.dtype.kind == "i" and ((rows >= 1) & (rows <= len(motion))).all()
     if not within or rows.ndim != 1 or rows.sum() != len(motion):
-        raise ValueError("the rows of the cases do not fit the motion")
+        raise ValueError("the rows of the cases do not match the motion")
     parts = np.split(motion.reshape(-1, vehicles, 3), np.cumsum(rows)[:-1])
     return dict(zip(index.tolist(), parts, strict=True))
 

@@ -182,9 +182,9 @@ def unrepeatable(second_runs: Sequence[SecondRun]) -> str | None:
     example = (verdicts or differing)[0]
     since = "" if example.differs_from_s is None else f" from {example.differs_from_s:g} s on"
     return (
-        f"Not repeatable: {len(differing)} of {counted(len(second_runs), 'case')} that ran twice "
-        f"went differently the second time, {len(verdicts) or 'none'} of them with another verdict "
-        f"(case {example.index}{since}). A controller draws random numbers or reads a clock, or "
-        "it keeps something from earlier episodes: a result depends on more than its case, and "
-        "other workers or another order may give others."
+        f"Not repeatable: {counted(len(second_runs), 'case')} ran twice, and {len(differing)} of "
+        f"them went differently the second time, {len(verdicts) or 'none'} with another verdict "
+        f"(case {example.index}{since}). The controller draws random numbers, reads a clock, or "
+        "keeps values from earlier episodes. Its results may change with the order of the cases "
+        "and the number of workers."
     )

@@ -124,12 +124,12 @@ def about(road: Road) -> list[str]:
     lines.append(f"{merge}, junction {road.junction_type}")
     yields = road.mainline_approach.yields, road.ramp_approach.yields
     first = {
-        (True, False): "the ramp goes first (are mainline and ramp exchanged?)",
-        (False, True): "the mainline goes first",
+        (True, False): "the ramp has priority (did you swap mainline and ramp?)",
+        (False, True): "the mainline has priority",
     }
-    lines.append(f"right of way: {first.get(yields, 'neither road goes first')}")
+    lines.append(f"right of way: {first.get(yields, 'neither road has priority')}")
     if road.lane_drop:
-        lines.append("one path comes to M on a lane that ends")
+        lines.append("one path reaches M on a lane that ends")
     return lines
 
 
@@ -189,8 +189,8 @@ def _differences(scenario: Scenario, trained: Scenario) -> list[str]:
         margin = ALIKE * (pool[1] - pool[0] or abs(known_low))
         if low < known_low - margin or high > known_high + margin:
             sentences.append(
-                f"{name} {_range(*scenario.bounds(name))} is like {_range(low, high)} in "
-                f"{trained.name} (trained on {_range(known_low, known_high)})"
+                f"{name} {_range(*scenario.bounds(name))} corresponds to {_range(low, high)} in "
+                f"{trained.name}; training used {_range(known_low, known_high)}"
             )
     return sentences
 

@@ -72,8 +72,8 @@ class CampaignSettings(SharedSettings):
             text = getattr(self, name) or ""
             if text != text.encode(errors="replace").decode():
                 raise UserError(
-                    f"`{name}` is {text!r}: it has bytes that are not UTF-8, which campaign.json "
-                    "cannot record; use another name"
+                    f"`{name}` is {text!r}: campaign.json cannot record bytes that are not UTF-8; "
+                    "choose another name"
                 )
         criterion = self.criterion
         object.__setattr__(self, "fail_when", criterion.fail_when)
@@ -84,8 +84,8 @@ class CampaignSettings(SharedSettings):
         self.new_sampler()
         if not 0.0 <= self.tolerated < 1.0:
             raise UserError(
-                f"`tolerated` is {self.tolerated}: choose the share of its runs in which a case "
-                "may fail, from 0 to below 1, say 0.1"
+                f"`tolerated` is {self.tolerated}: choose a share of failing runs from 0 to below "
+                "1, such as 0.1"
             )
         if self.seed < 0:
             raise UserError(f"`seed` is {self.seed}: it must be 0 or more")
@@ -95,10 +95,7 @@ class CampaignSettings(SharedSettings):
                 raise UserError(f"`{name}` is {number}: it must be 1 or more")
         self._check_levels()
         if self.in_flight is not None and self.batch is not None:
-            raise UserError(
-                "a search runs in batches or with cases in flight: leave `in_flight` or `batch` "
-                "away"
-            )
+            raise UserError("`in_flight` and `batch` cannot be combined: choose one of them")
         if self.against is not None:
             self._check_against(self.against)
         if not self.may_vary:  # a case fails in all of its runs or in none
@@ -106,24 +103,21 @@ class CampaignSettings(SharedSettings):
 
     def _check_levels(self) -> None:
         if not self.levels or len(set(self.levels)) < len(self.levels):
-            raise UserError(f"the levels are {list(self.levels)}: name each level once")
+            raise UserError(f"the levels are {list(self.levels)}: choose at least one, each once")
         if OWN in self.levels and self.pov is None:
-            raise UserError("level own needs a POV of your own: name one as `pov`")
+            raise UserError("level own needs your own POV: name it with `pov`")
 
     def _check_against(self, against: str) -> None:
         for name in ("in_flight", "repeat", "tolerated"):
             if name in non_defaults(self, Search):
-                raise UserError(
-                    f"`{name}` does not go with `against`, which runs each batch with two "
-                    "versions: leave one of them away"
-                )
+                raise UserError(f"`{name}` and `against` cannot be combined: remove one of them")
         if waits_for_client(against):
             raise UserError(
-                f"`against` is {against}: a client that a user starts drives one VUT; name an "
-                "earlier version that needs none"
+                f"`against` is {against}: a client that you start yourself drives one VUT only; "
+                "choose an earlier version that merge-sumo starts"
             )
         if against == self.vut:
-            raise UserError(f"`against` is {against}, and so is `vut`: name two versions")
+            raise UserError(f"`against` and `vut` are both {against}: name two different versions")
 
     @property
     def earlier(self) -> CampaignSettings:
@@ -132,7 +126,7 @@ class CampaignSettings(SharedSettings):
         Raises `UserError` where the campaign is against none.
         """
         if self.against is None:
-            raise UserError("the campaign is against no earlier version")
+            raise UserError("the campaign has no earlier version (`against`)")
         return replace(self, vut=self.against, against=None)
 
     def new_sampler(self, predictor: Predictor | None = None) -> Sampler:
@@ -260,8 +254,8 @@ def settings_from_folder(
     for name, spec in controllers(values).items():
         if name not in replaced:
             raise UserError(
-                f"{folder} was run with {name} {printable(spec[:NAME_CHARACTERS])}, and a run "
-                f"folder names no code to run: name it again with `{name}`"
+                f"{folder} ran with {name} {printable(spec[:NAME_CHARACTERS])}. A run folder "
+                f"cannot start code by itself: set `{name}` again"
             )
     if not isinstance(values.get("scenario"), Scenario):
         values["scenario"] = recorded_scenario(values, folder / SETTINGS)
@@ -270,7 +264,7 @@ def settings_from_folder(
         if field.name in values:
             known[field.name] = values[field.name]
         elif field.default is MISSING:
-            raise UserError(f"{folder / SETTINGS}: it has no {field.name}")
+            raise UserError(f"{folder / SETTINGS}: {field.name} is missing")
     try:
         return CampaignSettings(**known)
     except RecordError as error:

@@ -47,7 +47,7 @@ class BuiltInKind(ControllerKind):
             with explained(str(spec)):
                 self._design = replace(self._design, **settable)
         if built_in.ramp_only:
-            self.no_pov = "that is a VUT for the ramp; the POVs of levels 0 to 2 need no name"
+            self.no_pov = "this VUT drives on the ramp only; the POVs of levels 0 to 2 are built in"
 
     def driver(self, corridors: int, _simulation: object) -> Driver:
         """Return its driver.

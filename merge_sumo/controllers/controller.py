@@ -399,7 +399,7 @@ def as_answer(answer: Any) -> tuple[float, int]:
     number = np.asarray(acceleration)
     if number.shape != () or number.dtype.kind not in "fiu":
         shown = _shown(acceleration)
-        raise WrongAnswerError(f"answered {shown} instead of a number, or (number, merge)")
+        raise WrongAnswerError(f"answered {shown} instead of a number or (number, merge)")
     return float(number), request
 
 
@@ -407,7 +407,7 @@ def _as_merge_request(merge: Any) -> int:
     request = np.asarray(merge)
     if request.shape != () or request.dtype.kind not in "bfiu" or request not in (0, 1):
         shown = _shown(merge)
-        raise WrongAnswerError(f"requests {shown} instead of True or False, to merge or not")
+        raise WrongAnswerError(f"requested the merge with {shown} instead of True or False")
     return MERGE if request else STAY
 
 
@@ -425,7 +425,7 @@ def as_merge(number: float) -> bool:
         WrongAnswerError: for NaN and infinity.
     """
     if not math.isfinite(number):
-        raise WrongAnswerError(f"requests {number} instead of a number, to merge or not")
+        raise WrongAnswerError(f"requested the merge with {number} instead of a number")
     return number > MERGES_ABOVE
 
 

@@ -111,7 +111,7 @@ class Deadline:
         if isinstance(error, DeadlineExceeded):
             return f"took longer than the deadline of {self.deadline_s:g} s"
         if isinstance(error, BdbQuit):
-            return "a debugger was left; breakpoints work with `merge-sumo run --debug`"
+            return "a debugger ended the call; use breakpoints with `merge-sumo run --debug`"
         name = text_of(error, lambda error: type(error).__name__)
         return f"{name}: {text_of(error)}{text_of(error, _raised_at)}"
 
@@ -135,7 +135,7 @@ def close_within(deadline_s: float, close: Callable[[], Any]) -> None:
             deadline.stop()
     except BaseException as error:
         with suppress(OSError):
-            sys.stderr.write(f"closing the VUT: {deadline.reason(error)}\n")
+            sys.stderr.write(f"error while closing the VUT: {deadline.reason(error)}\n")
 
 
 def text_of(thing: object, as_text: Callable[[Any], str] = str) -> str:
@@ -148,7 +148,7 @@ def text_of(thing: object, as_text: Callable[[Any], str] = str) -> str:
     try:  # a subclass of `str` may override its methods: take its characters only
         return as_reason(str.__str__(as_text(thing)))[:MOST_CHARACTERS]
     except Exception as error:
-        return f"({type(error).__name__} when it was to be shown)"
+        return f"({type(error).__name__} while it was printed)"
 
 
 def _raised_at(error: BaseException) -> str:

@@ -62,7 +62,9 @@ class FmuKind(FileKind):
             raise UserError(f"{path} is not a readable FMU: {str(error)[:200]}") from error
         simulation, version = self._description.coSimulation, str(self._description.fmiVersion)
         if simulation is None or version[0] not in "23":
-            raise UserError(f"{path}: export it as an FMU for co-simulation by FMI 2.0 or 3.0")
+            raise UserError(
+                f"{path} is not a co-simulation FMU of FMI 2.0 or 3.0: export it as one"
+            )
         self.version, self._instances = version[0], 0
         if str(simulation.canBeInstantiatedOnlyOncePerProcess) == "True":
             self.max_corridors = 1
@@ -73,8 +75,8 @@ class FmuKind(FileKind):
                 self.inputs.append((index, variable))
         if not self.inputs:
             raise UserError(
-                f"{path} has none of the inputs {', '.join(INPUTS)}: name its own, as in "
-                f"fmu:{path}?v_vut_mps=NAME"
+                f"{path} has none of the inputs {', '.join(INPUTS)}: give the names of yours, as "
+                f"in fmu:{path}?v_vut_mps=NAME"
             )
         self.output = None
         if REACHED in self.chosen or OUTPUT not in self.chosen:

@@ -109,7 +109,7 @@ class ControllerProcess(ChildProcess):
         except ProcessDiedError as died:
             line = self.output.last_line()
             printed = f" (it printed: {line})" if line else ""
-            reason = f"opening the VUT {self._spec} {died}{printed}: look into the VUT"
+            reason = f"loading the VUT {self._spec}: {died}{printed}; check its code"
             raise ProcessDiedError(reason) from died
 
     def _receive_reply(self, patience_s: float, late: str) -> HostReply:

@@ -94,9 +94,9 @@ def spec_of_driver(vut: Any) -> str:
     spec = spec_of(vut)
     if is_in_process(spec):
         notice(
-            f"{parse(spec).argument} is an object, so it drives in this process, without workers, "
-            "and its faults may end the process; put its class or function into a module for a "
-            "process of its own",
+            f"{parse(spec).argument} is an object: it drives in this process, without workers, "
+            "and a crash of it ends this process. To give it a process of its own, put its class "
+            "or function into a module.",
             UserWarning,
         )
     return spec

@@ -86,12 +86,12 @@ def load(text: str, options: ControllerOptions | None = None) -> ControllerKind:
 
 def _why_unknown(name: str) -> str:
     if name.endswith(".py"):
-        return f"{name} is a file: name a class or a function of it, {name}:NAME"
+        return f"{name} is a file: name a class or a function in it, {name}:NAME"
     names = [*BUILT_IN_VUTS, *installed_vuts()]
     choice = f"{', '.join(names)}, or bring your own (`merge-sumo vuts` lists the kinds)"
     if not name:
-        return f"name the vehicle under test, as in `vut` design2: {choice}"
-    return f"there is no VUT {name!r}: {meant(name, (*names, *KINDS))}choose one of {choice}"
+        return f"no VUT is named: set `vut` to one of {choice}"
+    return f"unknown VUT {name!r}: {meant(name, (*names, *KINDS))}choose one of {choice}"
 
 
 def is_built_in(text: str) -> bool:

@@ -74,7 +74,7 @@ class OnnxKind(FileKind):
         except (ValueError, OverflowError):
             self.period_steps = 0
         if self.period_steps < 1:
-            raise UserError(f"{self.path}: {PERIOD} is {text!r}: give seconds, {DT_S} or more")
+            raise UserError(f"{self.path}: {PERIOD} is {text!r}: it must be {DT_S} s or more")
 
     def controller(self) -> Controller:
         """Return a controller of one corridor."""
@@ -100,16 +100,15 @@ class OnnxKind(FileKind):
             output = self.run((0.0, 0.0, 0.0, 0.0))
         except Exception as error:  # also of inputs of other types
             raise UserError(
-                f"{self.path} does not run with the inputs of a VUT: floats, (1, 4), with "
+                f"{self.path} does not run with the inputs of a VUT: floats of shape (1, 4) with "
                 f"{', '.join(STATE)}, and optionally {SEED}, a float, a double or an int64 "
                 f"({type(error).__name__}: {error})"
             ) from error
         if output.dtype.kind != "f" or output.size not in (1, 2, ACTIONS, ACTIONS + 1):
             raise UserError(
-                f"{self.path} gives {output.size} numbers of type {output.dtype}: a VUT gives "
-                f"floats, one acceleration or {ACTIONS} values of actions (without ArgMax), from "
-                "the hardest braking to the hardest acceleration, and optionally one more, which "
-                "is whether to merge"
+                f"{self.path} has {output.size} outputs of type {output.dtype}. A VUT has floats: "
+                f"one acceleration, or {ACTIONS} action values from the hardest braking to the "
+                "hardest acceleration (without ArgMax). One more output may request the merge."
             )
 
 

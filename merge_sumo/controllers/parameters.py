@@ -43,7 +43,7 @@ class Range:
         except ValueError:
             low = high = math.nan
         if not (name.strip() and -math.inf < low < high < math.inf):
-            raise UserError(f"`params` {text}: write NAME=LOW..HIGH, as headway_s=0.5..3")
+            raise UserError(f"`params` {text}: write NAME=LOW..HIGH, such as headway_s=0.5..3")
         return cls(name.strip(), low, high)
 
     @property
@@ -68,15 +68,14 @@ def values_of(controller: ControllerKind, ranges: Sequence[Range]) -> dict[str, 
         name = each.name
         if name not in known and controller.vut_type is not None:
             raise UserError(
-                f"`params` {name}: its present value is not known: write it into `vut` as "
-                f"{name}=VALUE"
+                f"`params` {name}: its present value is unknown: set it in `vut` with {name}=VALUE"
             )
         if name not in known:
             raise controller.spec.unknown_parameter(name, known)
         if not each.low <= known[name] <= each.high:
             raise UserError(
-                f"`params` {name}={each.low:g}..{each.high:g}: it is {known[name]:g} today, "
-                "which is not in that range: give a range around it"
+                f"`params` {name}={each.low:g}..{each.high:g}: the present value is "
+                f"{known[name]:g}: choose a range that contains it"
             )
         values[name] = float(known[name])
     return values

@@ -174,14 +174,14 @@ class LoggedProcess:
             os.killpg(self._process.pid, number)
 
 
-BROKEN = "broke the channel to its process"
+BROKEN = "broke the connection to its process"
 """The reason of a process that closes its connection, or sends an invalid reply."""
 
 
 class ProcessDiedError(ControllerError):
     """The child process of a controller has ended.
 
-    Its text is a phrase without its subject, as "ended its process with exit code 3".
+    Its text is a phrase, as "took longer than 30 s".
     """
 
 
@@ -300,12 +300,12 @@ class ChildProcess(LoggedProcess):
         if code is None:  # it closed the connection and still runs
             return ProcessDiedError(BROKEN)
         if code >= 0:
-            return ProcessDiedError(f"ended its process with exit code {code}")
+            return ProcessDiedError(f"its process ended with exit code {code}")
         try:
             name = signal.Signals(-code).name
         except ValueError:  # a real-time signal
             name = "unknown"
-        return ProcessDiedError(f"ended its process by signal {-code} ({name})")
+        return ProcessDiedError(f"its process was ended by signal {-code} ({name})")
 
 
 def parent_connection(settings: Mapping[str, Any], **limits: int) -> Connection:
@@ -339,8 +339,8 @@ def split_command(command: str) -> list[str]:
     program = arguments[0] if arguments else ""
     if shutil.which(program) is None:
         raise UserError(
-            f"the command {command!r}: there is no program {program!r}; write it as you would in a "
-            "terminal"
+            f"the command {command!r}: cannot find the program {program!r}; write the command as "
+            "in a terminal"
         )
     return arguments
 

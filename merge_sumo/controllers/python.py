@@ -171,7 +171,7 @@ class PythonObjectKind(ControllerKind):
         except UserError:
             raise
         except (Exception, SystemExit) as error:
-            how = "made" if self._is_class else "copied for each corridor (give its class)"
+            how = "made" if self._is_class else "copied for each corridor (give its class instead)"
             why = f"{type(error).__name__}: {text_of(error)}"
             raise UserError(f"{self.spec} cannot be {how}: {why}") from error
         return made
@@ -212,7 +212,7 @@ class PythonKind(PythonObjectKind):
         for part in name.split("."):
             target = getattr(target, part, None)
         if target is None:
-            raise UserError(f"{source} has no {name!r}: name a class or a function of it")
+            raise UserError(f"{source} has no {name!r}: name one of its classes or functions")
         if not is_code(target):
             raise self.not_a_vut(target)
         if file := getattr(module, "__file__", None):
@@ -244,7 +244,7 @@ class InProcessKind(PythonObjectKind):
         """
         if self.spec.argument not in objects:
             raise UserError(
-                f"{self.spec} was an object of a Python process: name a VUT, or give the object "
+                f"{self.spec} was an object of a Python process: name a VUT, or pass the object "
                 "again"
             )
         target = objects[self.spec.argument]
@@ -359,7 +359,7 @@ class BatchedDriver(ControllerDriver):
             if answer.shape not in ((k,), (2, k)) or answer.dtype.kind not in "fiu":
                 raise WrongAnswerError(
                     f"answered shape {answer.shape} of {answer.dtype} instead of {k} numbers, or "
-                    f"these and {k} merge requests"
+                    f"{k} numbers and {k} merge requests"
                 )
         except BaseException as error:
             reason, self._replace = self._deadline.reason(error), True
@@ -380,7 +380,7 @@ class BatchedDriver(ControllerDriver):
         known = (requests == MERGE) | (requests == STAY)
         self._merge_requests = np.where(active & known, requests, NO_REQUEST).astype(np.int8)
         for corridor in np.flatnonzero(active & ~known).tolist():
-            wrong = f"requests {requests[corridor]} instead of 1 or 0, to merge or not"
+            wrong = f"requested the merge with {requests[corridor]} instead of 1 or 0"
             self._reasons.setdefault(corridor, wrong)
 
     def parameters(self) -> Mapping[str, float]:

@@ -78,7 +78,7 @@ def check_call(function: Callable[..., Any], arguments: tuple[str, ...]) -> None
     if fits(function, len(arguments), seeded=name == "reset"):
         return
     parameters = ", ".join(_parameters(function))
-    called = f"{name}({parameters}) is called as {name}({', '.join(arguments)})"
+    called = f"{name}({parameters}) must accept the call {name}({', '.join(arguments)})"
     raise UserError(printable(called))
 
 

@@ -51,7 +51,7 @@ class ControllerOptions:
             ("vut_memory_gib", "GiB", self.memory_gib),
         ):
             if not (isinstance(value, int | float) and 0.0 < value < math.inf):
-                raise UserError(f"`{option}` is {value!r}: give {unit}, more than 0")
+                raise UserError(f"`{option}` is {value!r}: it must be a number of {unit} above 0")
 
 
 class ControllerSpec(msgspec.Struct, frozen=True):
@@ -86,7 +86,7 @@ class ControllerSpec(msgspec.Struct, frozen=True):
             except ValueError:
                 value = math.nan
             if not math.isfinite(value):
-                raise UserError(f"{self}: {name} is {text!r}: give a number")
+                raise UserError(f"{self}: {name} is {text!r}: it must be a number")
             numbers[name] = int(text) if text.lstrip("+-").isdecimal() else value
         return numbers
 
@@ -257,7 +257,7 @@ class ControllerKind:
             if sha256 not in self.files.values():
                 raise UserError(
                     f"{printable(name)}, code of the VUT {self.spec}, has changed since it was "
-                    "loaded: leave it as it is while it runs, and give all workers the same file"
+                    "loaded: do not change it during a run, and give all workers the same file"
                 )
         return self.driver(corridors, simulation)
 
@@ -337,6 +337,6 @@ class FileKind(ControllerKind):
             extra = f"pip install 'merge-sumo[{spec.kind}]'"
             raise UserError(f"{spec} needs {self.library}: run `{extra}`") from error
         if not self.path.is_file():
-            raise UserError(f"{spec}: there is no such file")
+            raise UserError(f"{spec}: the file does not exist")
         check_code(self.path)
         self.code = (self.path,)

@@ -70,7 +70,7 @@ class SumoKind(ControllerKind):
         spec = self.spec
         model = spec.argument
         if model not in MODELS:
-            raise UserError(f"{spec}: choose one of sumo:{', sumo:'.join(MODELS)}")
+            raise UserError(f"{spec} is unknown: choose one of sumo:{', sumo:'.join(MODELS)}")
         known = f"{SHARED_OPTIONS} {LANE_CHANGE_OPTIONS} {MODELS[model]}".split()
         self.settable = chosen = spec.numbers()
         for name, value in chosen.items():
@@ -78,7 +78,7 @@ class SumoKind(ControllerKind):
                 raise spec.unknown_parameter(name, known)
             least = -1 if name.startswith("lc") else 0
             if value < least:
-                raise UserError(f"{spec}: {name} is {value}: give a number from {least} up")
+                raise UserError(f"{spec}: {name} is {value}: it must be {least} or more")
         self.vut_type = {"carFollowModel": model}
         for name, value in (NO_NOISE.get(model, {}) | chosen).items():
             self.vut_type[name] = f"{value:.12g}"
@@ -94,7 +94,7 @@ class SumoKind(ControllerKind):
             UserError: without one.
         """
         if not isinstance(simulation, SumoSimulation):
-            raise UserError(f"{self.spec} drives in a SUMO simulation only")
+            raise UserError(f"{self.spec} drives only in a SUMO simulation")
         return SumoDriver(corridors, simulation)
 
 

@@ -219,7 +219,7 @@ class Design:
         for field in fields(self):
             value = getattr(self, field.name)
             if not (math.isfinite(value) and value >= 0.0):
-                raise UserError(f"{field.name} is {value}: it must be a number from 0 up")
+                raise UserError(f"{field.name} is {value}: it must be 0 or more")
 
 
 @dataclass(frozen=True, slots=True)

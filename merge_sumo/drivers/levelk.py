@@ -204,23 +204,23 @@ class QNetwork:
         count = max(len(tensors) // 2, 1)
         names = [(f"{i}.weight", f"{i}.bias") for i in range(count)]
         if set(tensors) - {LIMIT} != set(chain(*names)):
-            raise ValueError(f"its tensors are {sorted(tensors)}, and not 0.weight, 0.bias, ...")
+            raise ValueError(f"its tensors are {sorted(tensors)} instead of 0.weight, 0.bias, ...")
         layers = [(tensors[weight], tensors[bias]) for weight, bias in names]
         for i, (weight, bias) in enumerate(layers):
             outputs = ACTIONS if i == count - 1 else bias.size
             fits = weight.shape == (outputs, inputs) and bias.shape == (outputs,)
             if not fits or {weight.dtype, bias.dtype} != {np.dtype(np.float32)}:
                 raise ValueError(
-                    f"{i}.weight is {weight.shape} of {weight.dtype}, and {i}.bias is {bias.shape} "
-                    f"of {bias.dtype}: they must be float32, (outputs, {inputs}) and (outputs,), "
-                    f"with {ACTIONS} outputs in the end"
+                    f"{i}.weight is {weight.shape} of {weight.dtype}, and {i}.bias is "
+                    f"{bias.shape} of {bias.dtype}: they must be float32, (outputs, {inputs}) and "
+                    f"(outputs,), with {ACTIONS} outputs in the last layer"
                 )
             inputs = outputs
         if LIMIT not in tensors:
             return cls(layers)
         limit_mps2 = float(tensors[LIMIT].item())
         if not -20.0 <= limit_mps2 < 0.0:
-            raise ValueError("its limit of braking is not from -20 to below 0 m/s2")
+            raise ValueError("its braking limit is not from -20 to below 0 m/s2")
         return cls(layers, limit_mps2)
 
     def limited(self, scenario: Scenario) -> Scenario:

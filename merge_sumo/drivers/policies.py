@@ -73,9 +73,8 @@ def policies_in(folder: str | Path) -> Path:
     except (OSError, ValueError):
         pass
     raise UserError(
-        f"`policies`: {folder} has no readable manifest: name a folder of policies, such as "
-        "`merge-sumo train --out DIR` makes, or a shipped library: "
-        f"{', '.join(sorted(shipped))}"
+        f"`policies`: {folder} has no readable manifest: choose a folder that `merge-sumo train "
+        f"--out DIR` wrote, or a shipped library: {', '.join(sorted(shipped))}"
     )
 
 
@@ -191,14 +190,14 @@ def _parse(content: bytes, path: str, sha256: str, name: str) -> QNetwork:
 
     if hashlib.sha256(content).hexdigest() != sha256:
         raise UserError(
-            f"{path} is not the file that its manifest describes: get it again, or run "
-            f"`merge-sumo train --only {name}`"
+            f"{path} does not match its manifest: restore it, or run `merge-sumo train --only "
+            f"{name}`"
         )
     inputs = FEATURES + (SVO_FEATURES if name == "pov2" else 0)
     try:
         return QNetwork.from_tensors(load(content), inputs)
     except (SafetensorError, KeyError, ValueError, TypeError, IndexError, OverflowError) as error:
-        raise UserError(f"{path} holds no action-value network: {error}") from error
+        raise UserError(f"{path} is not an action-value network: {error}") from error
 
 
 def load_driver(name: str, corridors: int, folder: Path | None = None) -> LevelKDriver:

@@ -101,7 +101,7 @@ class Criterion:
         object.__setattr__(self, "fail_when", fail_when)
         if self.require is not None:
             if fail_when != PAPER:
-                raise UserError("`fail_when` and `require` both say what a failure is: choose one")
+                raise UserError("`fail_when` and `require` cannot be combined: choose one of them")
             object.__setattr__(self, "require", check_formula(self.require))
 
     def check(self, scenario: Scenario) -> None:
@@ -123,7 +123,7 @@ class Criterion:
             needs = MEASURES[name].only_with
             how = ", or a `follow_up_s` above 0" if needs == FOLLOW_UP else ""
             raise UserError(
-                f"`fail_when` speaks of {name}, which needs {needs}: choose another scenario than "
+                f"`fail_when` uses {name}, which needs {needs}: choose another scenario than "
                 f"{scenario.name}{how}"
             )
 

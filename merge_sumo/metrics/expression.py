@@ -73,14 +73,14 @@ def parse_condition(
         return _Parser(vocabulary, what, named).condition(tree), written
     except (SyntaxError, ValueError, MemoryError, RecursionError) as error:
         raise UserError(
-            f"{what} is not an expression over measures such as "
-            "'ttc_s < 1.5 or end == \"TIMEOUT\"', with and, or, not and comparisons as in Python"
+            f"{what} is not a condition over measures: write comparisons, and, or, not as in "
+            "Python, such as 'ttc_s < 1.5 or end == \"TIMEOUT\"'"
         ) from error
 
 
 def _check_length(text: str) -> None:
     if len(text) > MOST_CHARACTERS:
-        raise UserError(f"`fail_when` has {len(text)} characters: {MOST_CHARACTERS} are the most")
+        raise UserError(f"`fail_when` has {len(text)} characters: write at most {MOST_CHARACTERS}")
 
 
 class _Parser:
@@ -117,7 +117,9 @@ class _Parser:
         if texts or any(self._vocabulary[name] for name in names):
             return self._equality(sign, names, texts)
         if not names:
-            raise self._error("a comparison of two numbers says nothing of a case")
+            raise self._error(
+                "a comparison of two numbers does not depend on the case: compare a measure"
+            )
         match sign:
             case ast.Lt() | ast.LtE():
                 return _inequality(left, right, or_equal=isinstance(sign, ast.LtE))
@@ -128,12 +130,12 @@ class _Parser:
     def _equality(self, sign: ast.cmpop, names: list[str], texts: list[Any]) -> Condition:
         choices = self._vocabulary[names[0]] if len(texts) == len(names) == 1 else None
         if choices is None:
-            raise self._error("compare a measure that is a text with a text in quotes")
+            raise self._error("compare a text measure with a text in quotes")
         name, text = names[0], texts[0]
         if not isinstance(sign, ast.Eq | ast.NotEq):
             raise self._error(f"{name} is a text: compare it with == or !=")
         if text not in choices:
-            raise self._error(f"{name} is never {text!r}: it is {either(sorted(choices))}")
+            raise self._error(f"{name} cannot be {text!r}: choose {either(sorted(choices))}")
         met = Condition(lambda values: -1.0 if values[name] == text else 1.0, frozenset({name}))
         return met if isinstance(sign, ast.Eq) else _negated(met)
 
@@ -149,18 +151,20 @@ class _Parser:
             case ast.Constant(value=int() | float() as number) if not isinstance(number, bool):
                 # An integer may be too large for a float.
                 if number > sys.float_info.max:
-                    raise self._error("a number is to be finite")
+                    raise self._error("a number must be finite")
                 return float(number)
             case ast.UnaryOp(op=ast.USub(), operand=ast.Constant() as constant):
                 number = self._side(constant)
                 if isinstance(number, float):
                     return -number
-        raise self._error("is neither a measure nor a number nor a text", node)
+        raise self._error("is not a measure, a number or a text", node)
 
     def _unknown(self, name: str) -> UserError:
         known = *self._vocabulary, *self._named
         choice = f"{meant(name, known)}choose one of {', '.join(known)}"
-        return self._error(f"no measure {printable(name)!r} (a text is in quotes): {choice}")
+        return self._error(
+            f"unknown measure {printable(name)!r} (write a text in quotes): {choice}"
+        )
 
     def _error(self, why: str, node: ast.expr | None = None) -> UserError:
         shown = printable(ast.unparse(node)[:60]) + " " if node else ""

@@ -316,9 +316,9 @@ def _boundary_integral(tree: cKDTree, discs: IntArray, neighbours: int) -> tuple
     begin[begin < 0.0] += turn
     end = begin + 2.0 * half
 
-    # Cut the circle at angle 0: one more interval holds what reaches over the cut. With begins and
-    # ends sorted apart, the k-th end is followed by a gap if it comes before begin k + 1, for then
-    # as many intervals have ended there as have begun.
+    # Cut the circle at angle 0: one more interval covers the part beyond the cut. With begins and
+    # ends sorted separately, a gap follows the k-th end if that comes before begin k + 1: all k
+    # intervals that have begun have ended there.
     over = np.maximum(end.max(axis=1) - turn, 0.0)
     ends = np.sort(np.column_stack([over, np.minimum(end, turn)]), axis=1)
     begins = np.sort(np.column_stack([begin, np.full(len(discs), turn)]), axis=1)

@@ -197,7 +197,7 @@ class Measures:
 
         Args:
             trajectory: the motion.
-            lines: centre lines of the road; without them there is no clearance before M.
+            lines: centre lines of the road; without them the clearance before M is not measured.
         """
         (measures,) = measures_of([trajectory], lines)
         measures.compute_all()
@@ -413,7 +413,7 @@ class Measures:
         """Last time from which the VUT could have kept 6 m, if |dx| < 6 m at M.
 
         The VUT then accelerates or brakes fully by eq. (4). The other cars move as recorded, and
-        then keep their last speed. None if there is no such time, and if |dx| >= 6 m.
+        then keep their last speed. None without such a time, and if |dx| >= 6 m.
         """
         return last_avoidable_s(self.trajectory) if self.is_close else None
 
@@ -591,8 +591,8 @@ MEASURES: Registry[Measure[Any]] = Registry(
     OURS,
     accepts=_is_measure,
     contract=(
-        "a function with the decorator merge_sumo.metrics.measures.measure and a number `missing`, "
-        f"with a name that is none of {', '.join(sorted(RESERVED))}"
+        "a function with the decorator merge_sumo.metrics.measures.measure and a number "
+        f"`missing`, and its name must not be one of {', '.join(sorted(RESERVED))}"
     ),
 )
 

@@ -135,7 +135,7 @@ def check_from(from_s: float | None) -> None:
         UserError: it is neither None nor a finite number of 0 or below.
     """
     if from_s is not None and not (isinstance(from_s, int | float) and -1e300 <= from_s <= 0.0):
-        raise UserError(f"`from_s` is {from_s!r:.40}: give a number not above 0, such as -3")
+        raise UserError(f"`from_s` is {from_s!r:.40}: it must be 0 or below, such as -3")
 
 
 class Conflict(NamedTuple):

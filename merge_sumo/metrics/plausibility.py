@@ -42,7 +42,7 @@ def in_vain(cases: Mapping[str, int]) -> list[str]:
         cases: number of cases by command.
     """
     listed = ", ".join(f"{printable(name)} in {counted(n, 'case')}" for name, n in cases.items())
-    return [f"commanded in vain, because it changes nothing here: {listed}"] if cases else []
+    return [f"commands without effect here: {listed}"] if cases else []
 
 
 def _clipped(outcomes: Sequence[Outcome]) -> Iterator[str]:
@@ -52,7 +52,7 @@ def _clipped(outcomes: Sequence[Outcome]) -> Iterator[str]:
     if clipped > CLIPPED_SHARE * steps:
         scenario = outcomes[0].case.scenario
         yield (
-            f"not driven as asked: in {clipped} of {steps} steps the VUT asks for an acceleration "
-            f"outside {scenario.a_min_mps2:g} to {scenario.a_max_mps2:g} m/s2, which is clipped; "
-            "check the unit and the sign of its answers"
+            f"accelerations were clipped: in {clipped} of {steps} steps the VUT commanded more "
+            f"than the limits, {scenario.a_min_mps2:g} to {scenario.a_max_mps2:g} m/s2; check the "
+            "unit and the sign of its accelerations"
         )

@@ -73,7 +73,7 @@ class RunsOfCase:
     def deciding(self, tolerated: float = 0.0) -> Outcome:
         """Return the run that decides the case: it fails exactly where the case does.
 
-        Sort the runs, the worst first; skip as many as may fail; it is the next.
+        Of the runs, sorted from worst to best, it is the first after those that may fail.
 
         Args:
             tolerated: share of its runs in which a case may fail.
@@ -299,7 +299,7 @@ class Summary:
     def nothing_tested(self) -> str:
         """The sentence, without its full stop, on a campaign without a tested case."""
         safely = " without an error" if self.errors else ""
-        return f"nothing was tested: the VUT reached {self.goal}{safely} in no case"
+        return f"nothing was tested: the VUT never reached {self.goal}{safely}"
 
     @property
     def found(self) -> str:
@@ -521,6 +521,6 @@ def _parsed_gate(text: str) -> Gate:
             if 0.0 <= above < 1.0:
                 return Gate("fmc", above)
     raise UserError(
-        f'no gate {printable(text)!r}: choose {", ".join(NUMBERS)} or "fmc>X" with X '
-        'from 0 to below 1 (in quotes, or the shell takes the ">")'
+        f'unknown gate {printable(text)!r}: choose {", ".join(NUMBERS)} or "fmc>X" with X from 0 '
+        'to below 1 (in quotes, or the shell takes the ">")'
     )

@@ -75,23 +75,23 @@ def check_formula(text: str) -> str:
         UserError: it has an unknown word or sign, or a time that no episode has.
     """
     if len(text) > MOST_CHARACTERS:
-        raise UserError(f"`require` has {len(text)} characters: {MOST_CHARACTERS} are the most")
+        raise UserError(f"`require` has {len(text)} characters: write at most {MOST_CHARACTERS}")
     what = f"`require` {printable(text[:80])!r}"
     if unknown := _TOKEN.sub("", text):
         sign = printable(unknown[0])
         raise UserError(f"{what}: {sign!r} is not part of a formula over signals")
     for word in _WORD.findall(text):
         if word not in (*SIGNALS, *WORDS):
-            raise UserError(f"{what}: no signal {word!r}: choose {', '.join(SIGNALS)}")
+            raise UserError(f"{what}: unknown signal {word!r}: choose {', '.join(SIGNALS)}")
     depth = 0
     for sign in text:
         depth += (sign == "(") - (sign == ")")
         if depth < 0:
-            raise UserError(f"{what}: a bracket is closed that was not opened")
+            raise UserError(f"{what}: a closing bracket has no opening bracket")
     for bounds in _BOUNDS.findall(text):
         ends_s = [float(number) for number in _NUMBER.findall(bounds)]
         if ends_s != sorted(ends_s) or max(ends_s, default=0.0) > MAX_EPISODE_S + MAX_FOLLOW_UP_S:
-            raise UserError(f"{what}: no episode has a time [{bounds}], in seconds")
+            raise UserError(f"{what}: the times [{bounds}], in seconds, are not within an episode")
     return " ".join(text.split())
 
 
@@ -159,9 +159,9 @@ def _robustness(text: str, values: dict[str, FloatArray]) -> float:
     for node, part in specification.ast.offline_results.items():
         if type(node).__name__ in FINITE and not all(map(math.isfinite, part[:steps])):
             raise UserError(
-                f"`require` {printable(text[:80])!r} calculates with infinity: prev and next are "
-                "infinite outside of the episode, so put them around a comparison, not into it; "
-                "and write no number that large"
+                f"`require` {printable(text[:80])!r} has infinite values: prev and next are "
+                "infinite outside the episode. Put them around a comparison, not inside one, and "
+                "write smaller numbers"
             )
     return value
 

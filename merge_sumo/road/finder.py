@@ -44,7 +44,7 @@ VISIBILITY = "visibility"
 """Attribute of a connection: distance from which its driver sees the others, in m."""
 POINT_M = 1e-6
 """Length at which a lane is drawn that the file draws as a point."""
-NAME_LAST = "name the edge after the merge point as the last one of both"
+NAME_LAST = "end both with the edge after the merge point"
 INVALID = (AttributeError, IndexError, KeyError, TypeError, ValueError)
 """Errors of sumolib where a value of a net is missing or wrong."""
 MAINLINE, RAMP = 0, 1
@@ -98,8 +98,8 @@ def read_net(path: Path, content: bytes | None = None) -> RoadNet:
     root = parse_xml(content, f"the net {path}", NET_TAGS)
     if root.tag != "net":
         raise UserError(
-            f"{path} is not a SUMO net: it does not begin with <net>; netconvert makes a net of a "
-            "map (`--osm-files`, `--opendrive-files`)"
+            f"{path} is not a SUMO net: it does not begin with <net>; convert a map with "
+            "netconvert (`--osm-files`, `--opendrive-files`)"
         )
     reader = NetReader(withInternal=True)
     _feed(reader, root, path)
@@ -166,7 +166,8 @@ def find_road(
             return _road(road_net, edges, edge_at_m, room_after_m, lane_m)
     except INVALID as error:
         raise UserError(
-            f"{road_net.path} is not a valid SUMO net ({error!r:.200}): make it again by netconvert"
+            f"{road_net.path} is not a valid SUMO net ({error!r:.200}): convert it again with "
+            "netconvert"
         ) from error
 
 
@@ -381,15 +382,14 @@ def _window(lane: AccelerationLane | None, lane_m: Bounds) -> Bounds:
     """Return begin and end of the road's lane; refuse a lane of a scenario that is longer."""
     if lane is None:
         raise UserError(
-            "ramp and mainline meet in one point, without a lane of the ramp side by side: leave "
-            "lane_m out"
+            "ramp and mainline meet at a point, without an acceleration lane: remove lane_m"
         )
     begin_m, end_m = lane_m
     if begin_m < lane.begin_m:
         low, high = lane_around_m(lane.length_m)
         raise UserError(
-            f"lane_m is {begin_m:g} to {end_m:g}, {end_m - begin_m:g} m, and the acceleration lane "
-            f"is {lane.length_m:.1f} m long: write lane_m = [{low:.1f}, {high:.1f}]"
+            f"lane_m is {begin_m:g} to {end_m:g}, {end_m - begin_m:g} m, but the acceleration "
+            f"lane is {lane.length_m:.1f} m long: write lane_m = [{low:.1f}, {high:.1f}]"
         )
     return lane.begin_m, lane.end_m
 
@@ -413,13 +413,13 @@ def _split(
     for own, other in zip(*tails, strict=False):
         if own != other:
             raise UserError(
-                f"after edge {common} the mainline goes to {own} and the ramp to {other}; name "
-                "the same edges after the merge point"
+                f"after edge {common} the mainline continues on {own} and the ramp on {other}; "
+                "name the same edges after the merge point"
             )
     if on_main == 0 or on_ramp == 0:
         raise UserError(
-            f"mainline or ramp begins with edge {common}, which the other path uses too: name an "
-            "edge before it"
+            f"mainline or ramp begins with edge {common}, which both paths use: name an edge "
+            "before it"
         )
     return (mainline[:on_main], ramp[:on_ramp]), max(tails, key=len)
 
@@ -441,7 +441,9 @@ def _layers(net: SumoNet, edges: _Edges, common: int) -> list[_Layer]:
                 straightest = layer.get(link.target, link)
                 layer[link.target] = min(straightest, link, key=_swerve)
         if not layer and number <= common:
-            raise UserError(f"edge {edge} does not lead to edge {following}: name those in between")
+            raise UserError(
+                f"edge {edge} does not lead to edge {following}: name the edges in between"
+            )
         layers.append(layer)
     return layers
 

@@ -98,9 +98,8 @@ def road_for(scenario: Scenario) -> Road:
     ):
         if path.before_m < needed_m:
             raise UserError(
-                f"{' '.join(edges)} begins {path.before_m:.1f} m before the merge point, and a "
-                f"vehicle starts {needed_m:g} m before it: begin with an edge further upstream, or "
-                "start nearer"
+                f"{' '.join(edges)} begins {path.before_m:.1f} m before the merge point, but a "
+                f"vehicle starts {needed_m:g} m before it: add an edge upstream, or start nearer"
             )
     return road
 

@@ -53,7 +53,7 @@ def named_scenario(name: str) -> Scenario:
         return _read(resource("sumo_net") / f"{name}{SUFFIX}")
     if not name.endswith(SUFFIX):
         raise UserError(
-            f"there is no scenario {name!r}: choose {', '.join(known)}, or a file NAME{SUFFIX}"
+            f"unknown scenario {name!r}: choose {', '.join(known)}, or a file NAME{SUFFIX}"
         )
     scenario = _read(Path(name))
     if scenario.net is None:
@@ -69,32 +69,32 @@ def _read(path: Path) -> Scenario:
 
 
 COMMENTS = {
-    "net": "the SUMO net, next to this file",
+    "net": "the SUMO net; its path starts at the folder of this file",
     "mainline": "edges of the mainline in driving order, past the merge point M",
     "ramp": "edges of the ramp in driving order, past M",
-    "x_pov0_m": "starts of the POV: low, high; metres of its front bumper before M",
-    "v_pov0_mps": "its speed at the start: low, high",
+    "x_pov0_m": "start of the POV: low, high; position of its front bumper, negative before M",
+    "v_pov0_mps": "speed of the POV at the start: low, high",
     "x_vut0_m": "start of the VUT",
-    "v_vut0_mps": "its speed there; a range, as in [14.0, 22.0], is tested as a whole",
-    "tau_s": "reaction time with which a car of the mainline follows the car ahead",
-    "min_gap_m": "gap to the car ahead at standstill",
+    "v_vut0_mps": "speed of the VUT at the start; a range such as [14.0, 22.0] is sampled",
+    "tau_s": "reaction time of a car of the mainline that follows another",
+    "min_gap_m": "its gap to the car ahead at standstill",
     "pov_length_m": "length of the cars of the mainline",
     "vut_length_m": "length of the VUT",
     "a_min_mps2": "hardest braking of both",
     "a_max_mps2": "hardest acceleration of both",
-    "timeout_s": "an episode that has not ended by then is a TIMEOUT",
+    "timeout_s": "an episode that lasts longer ends as TIMEOUT",
     "follow_up_s": "duration of the simulation after the merge",
     "v_hw_min_mps": "lowest and highest speed of the mainline",
-    "v_min_mps": "below this the VUT is slow",
-    "ttc_min_s": "a time to collision below this is short",
-    "dx_crash_m": "front bumpers nearer than this at the merge: a collision",
-    "dx_critical_m": "nearer than this is critical",
+    "v_min_mps": "the VUT is slow below this speed",
+    "ttc_min_s": "a lower time to collision is short",
+    "dx_crash_m": "front bumpers nearer than this at the merge are a failure",
+    "dx_critical_m": "front bumpers nearer than this are critical",
     "level0_a_mps2": "acceleration of a level-0 VUT",
     "level0_v_mps": "speed up to which it accelerates",
     "reach_m": "no vehicle starts farther from M",
     "v_start_max_mps": "no vehicle starts faster",
-    "lane_m": "begin of the acceleration lane, at the gore or after it, and its end",
-    "lane_end": 'its end moves a VUT to the mainline; "stop" brakes it to a stand before it',
+    "lane_m": "begin and end of the acceleration lane; the begin is at the gore or after it",
+    "lane_end": 'at its end the VUT moves to the mainline; with "stop" it must stop before it',
 }
 """Comments on the values of a file that is written."""
 

@@ -65,7 +65,7 @@ class TreeInputs:
         """
         self._scenario = scenario
         self._step = 0
-        # A ring of what is remembered of the last steps, (steps, 5, R).
+        # A ring buffer of the last steps, (steps, 5, R).
         self._past = np.empty((1 + max(LAGS), 5, rows), dtype=np.float32)
         self._since_jump = np.zeros(rows)
         self._lowest = np.zeros(rows)

@@ -42,6 +42,6 @@ def make_sampler(name: str, pool: Pool, seed: int, predictor: Predictor | None =
         predictor: for samplers that use predictions.
 
     Raises:
-        UserError: there is no sampler of that name.
+        UserError: no sampler has that name.
     """
     return SAMPLERS[name](pool, seed, predictor)

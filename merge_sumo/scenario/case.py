@@ -90,7 +90,9 @@ class Case:
                 f"level is {self.level}: choose 0, 1 or 2, or {OWN} for a POV of your own"
             )
         if (self.svo_rad is None) == (self.level == 2):
-            raise UserError("svo_rad belongs to level 2, and only there: give it or leave it out")
+            raise UserError(
+                "svo_rad is for level 2 only: set it at level 2, and remove it at other levels"
+            )
         reach_m, most_mps = self.scenario.reach_m, self.scenario.v_start_max_mps
         for name, value, low, high in (
             ("x_pov0_m", self.x_pov0_m, -reach_m, 0.0),
@@ -113,8 +115,8 @@ class Case:
             apart_m = headway_s * self.v_pov0_mps
             if not (apart_m >= least_m and abs(self.x_pov0_m + side * apart_m) <= reach_m):
                 raise UserError(
-                    f"{name} is {headway_s}: the cars would be {apart_m:g} m apart; choose "
-                    f"{least_m:g} m or more, and not more than {reach_m:g} m from M"
+                    f"{name} is {headway_s}: the cars would be {apart_m:g} m apart; choose at "
+                    f"least {least_m:g} m, and at most {reach_m:g} m from M"
                 )
 
     def starts(self) -> list[tuple[float, float]]:
@@ -162,7 +164,7 @@ class Case:
         for coordinate in OPTIONAL:
             if (coordinate.of(self) is not None) != (coordinate.field in ranges):
                 raise UserError(
-                    f"{coordinate.field} belongs to a range of the scenario: give it there alone"
+                    f"{coordinate.field}: set it if the scenario has a range of it, and only then"
                 )
         if ranges:
             # They are made of the numbers of the case, which may be impossible.

@@ -37,7 +37,7 @@ def check_amount(name: str, value: Amount, possible: Bounds) -> None:
         if not low <= number <= high:
             raise UserError(f"{name} is {text}: choose {low:g} to {high:g}")
     if isinstance(value, tuple) and not value[0] < value[1]:
-        raise UserError(f"{name} is {text}: the first number of a range must be the lower")
+        raise UserError(f"{name} is {text}: write the lower number of a range first")
 
 
 @dataclass(frozen=True, kw_only=True, slots=True)

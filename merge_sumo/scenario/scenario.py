@@ -331,10 +331,10 @@ class Scenario:
         for name in ("v_pov0_mps", "v_vut0_mps"):
             yield name, self.bounds(name)[1] <= self.v_start_max_mps, speeds
         has_both = (self.headway_ahead_s is None) == (self.headway_behind_s is None)
-        yield "headway_behind_s", has_both, "both headways, or none"
+        yield "headway_behind_s", has_both, "both headways or neither"
         slowest_mps = self.v_pov0_mps[0]
         shortest_s = (self.pov_length_m + self.min_gap_m) / max(slowest_mps, 1e-9)
-        apart = f"{shortest_s:.2f} or more: else cars overlap at {slowest_mps:g} m/s"
+        apart = f"{shortest_s:.2f} or more, or cars overlap at {slowest_mps:g} m/s"
         for name in ("headway_ahead_s", "headway_behind_s"):
             headway_s = getattr(self, name)
             yield name, headway_s is None or shortest_s <= headway_s[0], apart

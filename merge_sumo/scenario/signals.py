@@ -146,7 +146,7 @@ def from_runs(record: SignalRuns, rows: int) -> Signals:
     for name, runs in record.items():
         # Before the values are repeated: a count in a hostile file may exceed the memory.
         if sum(count for count, _ in runs) != rows:
-            raise UserError("a signal has other rows than the motion")
+            raise UserError("a signal and the motion differ in their number of rows")
         values: list[RowValue] = []
         for count, value in runs:
             is_own = value is None or _valid_value(value) == value

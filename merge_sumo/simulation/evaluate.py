@@ -55,7 +55,7 @@ def simulate_part(
     Args:
         plan: how they run.
         cases: cases of the scenario of the plan.
-        keep: gives what is returned of an episode.
+        keep: returns the result of an episode.
 
     Raises:
         UserError: if the plan cannot be carried out.
@@ -149,7 +149,7 @@ def open_simulators(plan: SimulationPlan, workers: Workers) -> None:
     """
 
     def died(_: None) -> None:
-        raise UserError(f"opening the VUT {plan.vut.spec} or the POV ended its process")
+        raise UserError(f"loading the VUT {plan.vut.spec} or the POV ended the process")
 
     workers.collect(workers.submit(partial(_open_simulators, plan), [None], died))
 

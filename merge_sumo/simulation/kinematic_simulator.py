@@ -119,8 +119,8 @@ class KinematicSimulator(Simulator):
             return
         case = kinematic.case
         raise UserError(
-            f"the case {described(case)} at level {case.level} ends otherwise in SUMO "
-            "than by the equations of motion alone: choose `engine` sumo"
+            f"the case {described(case)} at level {case.level} ends differently in SUMO and by "
+            "the equations of motion: set `engine` to sumo"
         )
 
 

@@ -94,8 +94,8 @@ class SimulationPlan:
         """
         if not self.scenario.sense.is_perfect and self.vut.vut_type is not None:
             raise UserError(
-                f"the VUT {self.vut.spec} sees other cars in SUMO itself, where `sense` does not "
-                "reach: leave it away (`act` is for every VUT)"
+                f"the VUT {self.vut.spec} reads other cars from SUMO, so `sense` has no effect on "
+                "it: remove `sense` (`act` works with every VUT)"
             )
         if not self.policies_sha256:
             object.__setattr__(self, "policies_sha256", self.povs.sha256())
@@ -162,16 +162,16 @@ class SimulationPlan:
         if engine not in list(Engine):
             raise UserError(f"unknown engine {engine!r}: choose {' or '.join(Engine)}")
         if engine == Engine.KINEMATIC and self.needs_sumo is not None:
-            raise UserError(f"`engine` kinematic: {self.needs_sumo}; choose `engine` sumo")
+            raise UserError(f"`engine` kinematic: {self.needs_sumo}; set `engine` to sumo")
         return replace(self, engine=Engine(engine))
 
     @property
     def needs_sumo(self) -> str | None:
         """The reason why cases need SUMO; None if eq. (4) suffices."""
         if self.povs.own is not None:
-            return f"the POV {self.povs.own.spec} is not one of this package"
+            return f"the POV {self.povs.own.spec} is not built in"
         if self.vut.own_code or self.vut.asks_sumo:
-            return f"the VUT {self.vut.spec} is not one of this package"
+            return f"the VUT {self.vut.spec} is not built in"
         return None
 
     @property
@@ -207,8 +207,7 @@ class SimulationPlan:
                 continue
             if not is_auto:
                 raise UserError(
-                    f"`workers` is {requested}: {kind.spec} serves at most {kind.max_workers} at a "
-                    "time"
+                    f"`workers` is {requested}: {kind.spec} allows at most {kind.max_workers}"
                 )
             count = kind.max_workers
         if count > 1:
@@ -238,13 +237,13 @@ class SimulationPlan:
         """Raise `UserError` where the software of this process would give other outcomes."""
         for name, (expected, present) in differences(dict(self.versions), versions()).items():
             raise UserError(
-                f"a worker has {name} {present}, and this process {expected}: install the same "
-                "there"
+                f"a worker has {name} {present}, but this process has {expected}: install the "
+                "same version on both"
             )
         for name in differences(dict(self.policies_sha256), self.povs.sha256()):
             raise UserError(
-                f"a worker has another policy {name} in {self.povs.policies} than this process, or "
-                "none: put the same files there"
+                f"a worker has no policy {name} in {self.povs.policies}, or another one: copy the "
+                "files of this process there"
             )
 
 

@@ -85,7 +85,7 @@ class Povs:
             return asked
         most = self.own.max_corridors
         if most < cars:
-            raise UserError(f"the POV {self.own.spec}: it drives {most} car at a time, not {cars}")
+            raise UserError(f"the POV {self.own.spec} drives {most} car at a time, not {cars}")
         return min(asked, most // cars)
 
 
@@ -123,7 +123,7 @@ def parse_levels(asked: AnyLevels, policies: Path, *, own: bool) -> tuple[int, .
     by_name = {level_name(level): level for level in ALL_LEVELS}
     for name in names:
         if name not in by_name:
-            raise UserError(f"there is no POV level {name!r}: choose {CHOICE}")
+            raise UserError(f"unknown POV level {name!r}: choose {CHOICE}")
         check_level(by_name[name], available, policies)
     if own and level_name(OWN) not in names:
         raise UserError(f"`pov` drives at `level` own or all, not at `level` {','.join(names)}")
@@ -141,8 +141,8 @@ def check_level(level: int, available: Collection[int], policies: Path) -> None:
     if level in available:
         return
     if level in POLICIES:
-        raise UserError(f"there is no policy for a POV of level {level}{how_to_train(policies)}")
-    raise UserError(f"there is no POV level {level_name(level)}: choose {CHOICE}")
+        raise UserError(f"no policy for a POV of level {level}{how_to_train(policies)}")
+    raise UserError(f"unknown POV level {level_name(level)}: choose {CHOICE}")
 
 
 def one_level(text: str, policies: Path, *, own: bool) -> int:
@@ -154,7 +154,7 @@ def one_level(text: str, policies: Path, *, own: bool) -> int:
         own: whether the user brings a POV.
     """
     if text == "all" or "," in text:
-        raise UserError(f"`level` {text} does not go here: choose one level")
+        raise UserError(f"`level` {text} is not possible here: choose one level")
     return parse_levels(text, policies, own=own)[0]
 
 

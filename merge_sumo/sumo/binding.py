@@ -51,7 +51,7 @@ def scratch_folder() -> Iterator[Path]:
         made = ScratchFolder()
     except OSError as error:
         raise UserError(
-            f"cannot write a temporary folder: {error.strerror}; set TMPDIR to a folder"
+            f"cannot write a temporary folder: {error.strerror}; set TMPDIR to a writable folder"
         ) from error
     with made as name:
         yield Path(name)
@@ -74,9 +74,9 @@ def load_libsumo() -> Any:
     version = str(libsumo.getVersion()[1]).removeprefix("SUMO ")
     if version != SUMO_VERSION:
         raise UserError(
-            f"libsumo is of SUMO {version}, and merge-sumo needs {SUMO_VERSION}: run `pip install "
+            f"libsumo has SUMO {version}, but merge-sumo needs {SUMO_VERSION}: run `pip install "
             f"--force-reinstall --no-deps libsumo=={SUMO_VERSION} eclipse-sumo=={SUMO_VERSION}`, "
-            "and keep packages that bring another SUMO (older libtraci) out of this environment"
+            "and remove packages that install another SUMO (older libtraci)"
         )
     return libsumo
 

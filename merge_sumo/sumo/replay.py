@@ -143,7 +143,7 @@ def replay(folder: Path, from_s: float | None = None) -> Replay:
     elif different := _first(off_m):
         row, car = different
         diverged_at_s = row * DT_S
-        detail = f"{VEHICLES[car]} is recorded as not moving at its speed"
+        detail = f"the recorded motion of {VEHICLES[car]} does not match its speed"
     outcome = episode.outcome
     told = timeline(outcome, episode.trajectory, centre_lines(episode.road))
     words = *told.lines(outcome.case, f"case {outcome.index}"), *begins
@@ -202,8 +202,8 @@ def _read(folder: Path) -> _Episode:
     net = folder / NET
     if not net.exists():
         raise UserError(
-            f"{folder} has no {NET}, as replay folders of earlier versions: move it away, and "
-            "export the case again"
+            f"{folder} has no {NET}, because an earlier version wrote it: move it, and export the "
+            "case again"
         )
     outcome = _outcome(folder / CASE)
     road = road_of_hosted(read_xml(net, "the net"), net, outcome.case.scenario.lane_m)
@@ -218,7 +218,7 @@ def _read(folder: Path) -> _Episode:
     motion = _motion(record, lanes, road, name)
     end_s = outcome.measures.t_end_s
     if not 0 <= round(end_s / DT_S) < len(motion):
-        raise UserError(f"{folder} ends at {end_s:g} s, and its record does not")
+        raise UserError(f"{folder} ends at {end_s:g} s, but its record does not")
     return _Episode(road, outcome, outcome.trajectory(motion), record)
 
 
@@ -247,7 +247,7 @@ def _record(path: Path, name: str) -> tuple[FloatArray, dict[tuple[int, int], st
                 numbers = [float(car.attrib[column]) for column in COLUMNS]
                 in_range = all(abs(number) <= FARTHEST_M for number in numbers)
                 if step < 0.0 or abs(step - index[0]) > TOLERANCE or index in lanes or not in_range:
-                    raise ValueError("it is out of range, between steps, or repeats one")
+                    raise ValueError("a value is out of range, between steps or repeated")
                 record[index] = numbers
                 lanes[index] = str(car.attrib["lane"])
             except (IndexError, KeyError, OverflowError, ValueError) as error:

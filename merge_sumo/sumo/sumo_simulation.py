@@ -102,7 +102,7 @@ class SumoSimulation:
         """
         if SumoSimulation._open:
             raise UserError(
-                "libsumo holds one simulation per process: close the other SumoSimulation first"
+                "libsumo runs one simulation per process: close the other SumoSimulation first"
             )
         self.corridors = corridors
         self.road = road or road_of()

@@ -77,13 +77,13 @@ class MergeEnv(gymnasium.Env[FloatArray, np.int64]):
         """
         if opponent not in OPPONENTS.get(role, ()):
             raise UserError(
-                f"a {role} cannot play against {opponent!r}: `role` is pov or vut, and `opponent` "
-                "is level0 or a policy of the other one, such as vut1"
+                f"a {role} cannot play against {opponent!r}: `role` must be pov or vut, and "
+                "`opponent` level0 or a policy of the other role, such as vut1"
             )
         is_psi = isinstance(svo, int | float) and SVO.low <= svo < SVO.high
         if svo is not None and (role == "vut" or not (svo == "random" or is_psi)):
             raise UserError(
-                f"svo is {svo!r}: choose 'random', or 0 up to, and below, pi/2, for a POV"
+                f"svo is {svo!r}: choose 'random', or for a POV a number from 0 to below pi/2"
             )
         network = None if opponent == "level0" else load_network(opponent)
         self.game = Game(role, network, Reward.of(of_two(scenario)))
@@ -129,7 +129,7 @@ class MergeEnv(gymnasium.Env[FloatArray, np.int64]):
         """
         if not self.action_space.contains(action):
             raise UserError(
-                f"an action is a whole number from 0 to {ACTIONS - 1}: not {action!s:.60}"
+                f"an action must be a whole number from 0 to {ACTIONS - 1}, not {action!s:.60}"
             )
         a_mps2 = self.game.actions_mps2[[action]]
         self._state, reward, over = self.game.advance(self._state, self._svo_rad, a_mps2)

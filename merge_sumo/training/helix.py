@@ -104,8 +104,8 @@ def train_library(
     scenario = of_two(scenario)
     if a_min_mps2 is not None and not scenario.a_min_mps2 <= a_min_mps2 < 0.0:
         raise UserError(
-            f"the hardest braking of a POV is {a_min_mps2:g} m/s2: choose with `a_min` a "
-            f"number from {scenario.a_min_mps2:g} to below 0"
+            f"`a_min` is {a_min_mps2:g} m/s2: choose a number from {scenario.a_min_mps2:g} to "
+            "below 0"
         )
     road_for(scenario)  # the check needs it in the end
     _make_library(folder)
@@ -129,7 +129,7 @@ def train_library(
         for name in plans:
             entry = read_manifest(folder)[name]
             if "check" in entry:
-                say(f"{name} is there already")
+                say(f"{name} exists already")
                 continue
             check = check_policy(name, folder, settings.check_cases, scenario)
             _write_entry(folder, name, {**entry, "check": to_plain(check)})
@@ -151,7 +151,7 @@ def _make_library(folder: Path) -> None:
     with writing(folder):
         if any(folder.iterdir()):
             raise UserError(
-                f"{folder} holds other things than policies: choose another folder with `out`"
+                f"{folder} has other files than policies: choose another folder with `out`"
             )
     write_new(manifest, to_json({"networks": {}}, indent=2))
 
@@ -316,8 +316,8 @@ def train_and_check(
     if not settings.check:
         if settings.out is None and not plays_as(played, US23):
             raise UserError(
-                f"the shipped policies are for {US23.name}: name with `out` a folder for those for "
-                f"{played.name}"
+                f"the shipped policies are for {US23.name}: set `out` to a folder for the "
+                f"policies of {played.name}"
             )
 
         def progressed(now: TrainingProgress) -> None:
@@ -337,8 +337,8 @@ def train_and_check(
     trained_for = scenario_of(manifest.get(names[0], {}))
     if scenario is None and not plays_as(trained_for, US23):
         raise UserError(
-            f"{folder} was trained for {trained_for.name}: say with `scenario` in which one to "
-            f"check it, or {US23.name}"
+            f"{folder} was trained for {trained_for.name}: set `scenario` to the one to check it "
+            f"in, {trained_for.name} or {US23.name}"
         )
     checks = PolicyChecks()
     for name in names:

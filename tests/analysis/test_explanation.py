@@ -87,7 +87,7 @@ class TestACampaign:
         )
         assert run.failures
         assert not (run.folder / EXPLANATIONS.name).exists()
-        with pytest.raises(UserError, match=r"case \d+ ends otherwise .* the VUT is not that"):
+        with pytest.raises(UserError, match=r"case \d+ ended differently .* the VUT has changed"):
             ms.explain(run)
 
 
@@ -177,9 +177,9 @@ class TestParameters:
     ("case", "params", "words"),
     [
         (None, ["gap=1..2"], "has no parameter 'gap': choose from"),
-        (None, ["gap_m=1..2"], "it is 16.2 today, which is not in that range"),
+        (None, ["gap_m=1..2"], "the present value is 16.2: choose a range"),
         (None, ["gap_m=8"], "write NAME=LOW..HIGH"),
-        ("passed", [], "did not fail: name a failure"),
+        ("passed", [], "did not fail: choose a case that failed"),
     ],
 )
 def test_what_cannot_be_explained_is_refused_in_a_sentence(made, case, params, words):
@@ -189,7 +189,7 @@ def test_what_cannot_be_explained_is_refused_in_a_sentence(made, case, params, w
 
 
 def test_a_parameter_of_sumo_needs_its_present_value_in_the_spec():
-    with pytest.raises(UserError, match="write it into `vut` as accel=VALUE"):
+    with pytest.raises(UserError, match="set it in `vut` with accel=VALUE"):
         values_of(load("sumo:IDM"), [Range("accel", 0.0, 3.0)])
 
 
@@ -198,5 +198,5 @@ def test_a_controller_that_has_changed_is_refused(tmp_path):
     mine.write_text("def drive(seen):\n    return 1.0\n")
     own = uniform(f"{mine}:drive", tmp_path / "run", 60)
     mine.write_text("def drive(seen):\n    return -0.5 if seen.t_s < 4.0 else 0.5\n")
-    with pytest.raises(UserError, match="nothing can be said of its changes"):
+    with pytest.raises(UserError, match="ended differently when it ran again"):
         ms.explain(own, vut=f"{mine}:drive")

@@ -153,12 +153,12 @@ class TestADistribution:
         ("text", "says"),
         [
             ({"x_pov0": {}}, "'x_pov0'"),
-            ({"levels": {"3": 1}}, "levels of the campaign"),
-            ({"levels": {"1": 1e308, "2": 1e308}}, "a finite sum"),
+            ({"levels": {"3": 1}}, "does not have all of these levels"),
+            ({"levels": {"1": 1e308, "2": 1e308}}, "finite weights"),
             ({"x_pov0_m": {"kind": "beta"}}, "'beta'"),
             ({"x_pov0_m": {"kind": "uniform", "low": -400}}, "-340 to -180"),
             ({"svo_rad": {"kind": "histogram", "edges": [0, 1], "weights": [1, 1]}}, "3 edges"),
-            ({"svo_rad": {"kind": "histogram", "edges": [1, 0], "weights": [1]}}, "rise"),
+            ({"svo_rad": {"kind": "histogram", "edges": [1, 0], "weights": [1]}}, "rising"),
         ],
         ids=str,
     )
@@ -184,7 +184,7 @@ class TestATraffic:
     @pytest.mark.parametrize(
         ("scenario", "says"),
         [
-            (named_scenario("us23-traffic"), "us23-traffic has cars ahead of the POV"),
+            (named_scenario("us23-traffic"), "us23-traffic has its own cars ahead"),
             (named_scenario("roundabout"), "less than 1% of the speeds of mine"),
         ],
         ids=["headways", "other speeds"],
@@ -238,7 +238,7 @@ class TestOfACampaign:
         ("options", "says"),
         [
             ({"confidence": 1.0}, "`confidence` is 1.0"),
-            ({"traffic": "exid-5", "distribution": "d.json"}, "a distribution or a traffic"),
+            ({"traffic": "exid-5", "distribution": "d.json"}, "cannot be combined"),
         ],
     )
     def test_refuses_what_makes_no_sense(self, campaign, tmp_path, options, says):

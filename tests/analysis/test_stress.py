@@ -98,7 +98,7 @@ def test_flips_by_hand(run):
 def test_sumo_own_drivers_are_stressed_but_for_the_step(tmp_path):
     own = ms.campaign("sumo:Krauss", cases=4, level=0, sampler="uniform", out=tmp_path / "run")
     skipped = {one.name: one.skipped for one in ms.stress(own).rungs if one.skipped}
-    assert skipped == {"step": "sumo:Krauss drives in a SUMO simulation only"}
+    assert skipped == {"step": "sumo:Krauss drives only in a SUMO simulation"}
 
 
 class TestAShorterStep:

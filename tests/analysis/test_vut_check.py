@@ -54,7 +54,7 @@ def test_of_a_good_vut_it_says_nothing_wrong_and_what_a_step_costs(check):
     [
         (
             "import random\ndef Vut(seen):\n    return random.random()\n",
-            "the same cases run again in another order",
+            "the same cases run in another order",
         ),
         (
             CLASS.format(reset="pass", act="self.shared[0] += 1; return self.shared[0] % 7 * 0.1"),
@@ -69,15 +69,15 @@ def test_of_a_good_vut_it_says_nothing_wrong_and_what_a_step_costs(check):
             "mixes the corridors of `act_batch`",
         ),
         ("def Vut(seen):\n    return None\n", "16 of 16 ordinary cases end as VUT_ERROR"),
-        ("def Vut(seen):\n    return 1.0 / seen.v_vut_mps\n", "From standstill it ends as"),
-        ("def Vut(seen):\n    return 0.1 * (seen.v_vut_mps > 1)\n", "it never starts"),
+        ("def Vut(seen):\n    return 1.0 / seen.v_vut_mps\n", "From standstill: VUT_ERROR"),
+        ("def Vut(seen):\n    return 0.1 * (seen.v_vut_mps > 1)\n", "the VUT never starts"),
         (
             "class Vut:\n    def __init__(self):\n        raise ValueError('no licence')\n"
             "    def act(self, seen):\n        return 0.0\n",
-            "It does not start: ",
+            "The VUT does not start: ",
         ),
-        ("raise ValueError('no licence')\n", "It does not start: cannot load the VUT"),
-        ("import os\nos._exit(3)\n", "It does not start: opening the VUT"),
+        ("raise ValueError('no licence')\n", "The VUT does not start: cannot load the VUT"),
+        ("import os\nos._exit(3)\n", "The VUT does not start: loading the VUT"),
     ],
 )
 def test_what_is_wrong_is_said_in_a_sentence(check, source, problem):
@@ -89,7 +89,7 @@ def test_what_is_wrong_is_said_in_a_sentence(check, source, problem):
 def test_limits_are_a_note(check):
     code, said = check("def Vut(seen):\n    return 5.0\n")
     assert code == 0
-    assert "steps the VUT asks for an acceleration outside -4 to 2 m/s2" in said
+    assert "steps the VUT commanded more than the limits, -4 to 2 m/s2" in said
 
 
 @pytest.mark.parametrize(

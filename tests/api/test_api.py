@@ -50,8 +50,8 @@ def test_a_name_that_is_not_there_is_an_attribute_error():
     [
         ("campaign", {"seed": 1.5}, "seed is 1.5: it must be a whole number"),
         ("campaign", {"cases": 0}, "`cases`"),
-        ("campaign", {"vut": None}, "name the vehicle under test"),
-        ("campaign", {"workers": "2"}, "workers is '2': give a number of processes"),
+        ("campaign", {"vut": None}, "no VUT is named"),
+        ("campaign", {"workers": "2"}, "`workers` is '2': give a number of processes"),
         ("campaign", {"workers": 0}, "`workers` is 0: it must be a whole number, 1 or more"),
         ("run", {"x_pov0_m": "a", "v_pov0_mps": 30.0}, "x_pov0_m is 'a': it must be a number"),
         ("truth", {"level": 0, "seed": -1}, "it must be a whole number"),

@@ -101,7 +101,7 @@ class TestAFolderThatVanishes:
 
     def test_for_temporary_files_is_named(self, tmp_path, monkeypatch):
         monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "gone"))
-        with pytest.raises(UserError, match="set TMPDIR to a folder"):
+        with pytest.raises(UserError, match="set TMPDIR to a writable folder"):
             Simulator(plan_for("design1", corridors=1))
 
 

@@ -82,7 +82,7 @@ class TestFinds:
         assert all(o.measures.dx_m == pytest.approx(gap_m(o.case, 0.0)) for o in earlier.outcomes)
         path = Path("run") / AGAINST / OUTCOMES
         path.write_bytes(b"".join(path.read_bytes().splitlines(keepends=True)[:5]))
-        with pytest.raises(UserError, match="against does not have the cases of run"):
+        with pytest.raises(UserError, match="against and run have different cases"):
             run.read_earlier()
 
 
@@ -100,9 +100,9 @@ class TestRefuses:
     @pytest.mark.parametrize(
         ("changes", "sentence"),
         [
-            ({"in_flight": 4}, "`in_flight` does not go with `against`"),
-            ({"against": "traci"}, "name an earlier version that needs none"),
-            ({"against": "new.py:f"}, "name two versions"),
+            ({"in_flight": 4}, "`in_flight` and `against` cannot be combined"),
+            ({"against": "traci"}, "a client that you start yourself"),
+            ({"against": "new.py:f"}, "name two different versions"),
         ],
     )
     def test_what_does_not_go_together(self, changes, sentence):

@@ -183,7 +183,7 @@ class TestARun:
             run.trajectory(2)
         for name in ("outcomes.jsonl", "campaign.json"):
             (folder / name).unlink()
-            with pytest.raises(UserError, match=f"not a campaign.*{name}"):
+            with pytest.raises(UserError, match=f"not a run folder.*{name}"):
                 RecordedCampaign(folder)
 
     def test_runs_no_code_that_hides_in_trajectories(self, folder):

@@ -183,7 +183,7 @@ def test_cases_ahead_are_recorded_as_in_turn(tmp_path, monkeypatch):
     ("changes", "sentence"),
     [
         ({"in_flight": 0}, "`in_flight` is 0: it must be 1 or more"),
-        ({"in_flight": 8, "batch": 4}, "leave `in_flight` or `batch` away"),
+        ({"in_flight": 8, "batch": 4}, "`in_flight` and `batch` cannot be combined"),
     ],
 )
 def test_nonsense_is_refused_in_a_sentence(changes, sentence):

@@ -65,12 +65,12 @@ class TestTheCommand:
     @pytest.mark.parametrize(
         ("arguments", "part"),
         [
-            (SAFE, "say with --vut who drives"),
+            (SAFE, "no VUT is named: set --vut"),
             (("--vut", "my_vut.py", *SAFE), "my_vut.py:NAME"),
             (("--vut", "design2", "--x", "-300"), "--v is missing"),
             (("--vut", "design2", *SAFE, "--psi", "0.2"), "--psi is not a coordinate of"),
             (("--vut", "design2", *SAFE[2:], "--level", "all"), "--level all"),
-            (("--case", "nowhere", "3"), "is not a campaign: cannot read"),
+            (("--case", "nowhere", "3"), "is not a run folder: cannot read"),
         ],
     )
     def test_is_refused_in_a_sentence(self, command_line, arguments, part):

@@ -45,13 +45,13 @@ def test_a_controller_that_remembers_is_named_everywhere(write_vut, tmp_path):
     assert differing
     said = unrepeatable(repeats)
     assert said is not None
-    assert f"{len(differing)} of 8 cases" in said
+    assert f"8 cases ran twice, and {len(differing)} of them" in said
     assert said.split(" (case")[0] in write_report(run).read_text()
     assert said.split(" (case")[0] in ms.open_run(folder)._repr_html_()
     # check-vut finds it, too.
     checked = invoke("check-vut", spec)
     assert checked.exit_code == 1
-    assert "keeps something from earlier episodes" in checked.stdout
+    assert "keeps values of earlier episodes" in checked.stdout
 
 
 def test_drivers_of_the_package_and_clients_that_a_user_starts_run_once(run):
@@ -69,5 +69,5 @@ def test_a_changed_file_is_refused_by_its_line(run, tmp_path):
         (tmp_path / name).write_bytes((run.folder / name).read_bytes())
     line = '{"index":3,"differs_from_s":1.5,"end":"MERGED","failed":false,"other_verdict":true}\n'
     (tmp_path / REPEATS).write_text(line + line.replace("MERGED", "<script>"))
-    with pytest.raises(UserError, match=r"line 2 of .*repeats.jsonl is not as it was written"):
+    with pytest.raises(UserError, match=r"line 2 of .*repeats.jsonl is damaged"):
         read_second_runs(RecordedCampaign(tmp_path))

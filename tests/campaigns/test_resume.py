@@ -102,7 +102,7 @@ class TestWhatDiffers:
     @pytest.mark.parametrize(
         ("given", "name"),
         [
-            ({"seed": 3}, "seed differs: .* run with 2, now it is 3; make it the same, or start"),
+            ({"seed": 3}, "seed differs: .* ran with 2, now it is 3; set it as before, or start"),
             ({"fail_when": "contact"}, "fail_when differs"),
             ({"levels": (1,)}, "levels differs"),
             ({"cases": 24}, "cases differs: .* with 28, now it is 24; give 28 or more, or start"),
@@ -146,7 +146,7 @@ class TestTwoProcessesOnOneFolder:
     def test_are_one_too_many(self, folder):
         journal, _, _ = Journal.reopen(folder)
         before = contents(folder)
-        with journal, pytest.raises(UserError, match="another process writes"):
+        with journal, pytest.raises(UserError, match="another process is writing"):
             resume_campaign(folder)
         assert contents(folder) == before
         resume_campaign(folder)

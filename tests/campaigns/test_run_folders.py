@@ -81,7 +81,7 @@ class TestARunFolder:
     def test_has_no_code_run_by_any_command(self, mine, tmp_path, command_line):
         for command in verbs(mine / "run", tmp_path):
             said = command_line(*command)
-            assert_refused(said, "a run folder names no code to run: name it again with --vut")
+            assert_refused(said, "A run folder cannot start code by itself: set --vut again")
         for command in (("report", "run"), ("replay", "run", 0), ("compare", "run", "run")):
             assert command_line(*command)[0] == 0
         assert not ran(mine)
@@ -115,7 +115,7 @@ class TestARunFolder:
             few = {"cases": 4, "batch": 2, "sampler": "uniform"}
             run_campaign(campaign_settings(**given, **few), Path(name))
             ran(mine)
-            assert_refused(command_line("campaign", "--resume", name, "-q"), f"again with --{name}")
+            assert_refused(command_line("campaign", "--resume", name, "-q"), f"set --{name} again")
             assert not ran(mine)
             words = shlex.split(campaign_command("rerun", Path(name), read_settings(Path(name)), 0))
             assert command_line(*words[1:], "-q")[0] == 0
@@ -130,7 +130,7 @@ class TestAChangedController:
         assert_refused(said, f"vut_files.{file} differs", "or start a new campaign")
         assert (mine / "run" / OUTCOMES).read_bytes() == before
         _, _, err = command_line("run", "--case", "run", 0, "--vut", SPEC)
-        assert f"note: {file} is not as it was in run" in err
+        assert f"note: {file} has changed since run" in err
         code, _, err = command_line("rerun", "run", 0, "--vut", SPEC, "-q")
         assert (code, err) == (0, "")
 

@@ -84,7 +84,7 @@ class TestACampaignThatCannotRunIsRefusedInOneSentence:
 
         monkeypatch.setattr(libsumo, "getVersion", lambda: (21, "SUMO 1.18.0"))
         said = call(*SMALL, "--cases", 4, "-q", "--out", "run", "--workers", 1)
-        assert_refused(said, "libsumo is of SUMO 1.18.0", "pip install --force-reinstall")
+        assert_refused(said, "libsumo has SUMO 1.18.0", "pip install --force-reinstall")
 
 
 def cannot_import(monkeypatch, module: str, error: ImportError) -> None:

@@ -69,7 +69,7 @@ class TestOptions:
             (["campaign", "--seed", "1", "--seed", "2"], "--seed specified multiple times"),
             (["run", "--at", "x_pov0_m"], "give NAME=NUMBER"),
             (["vuts", "so", "many"], "Unused Tokens: ['so', 'many']."),
-            (["campaign", "design1", "--fail-when", "-x < 3"], "-x is neither a measure"),
+            (["campaign", "design1", "--fail-when", "-x < 3"], "-x is not a measure"),
             (["campaign", "--no-such-option", "3"], "--no-such-option"),
             (["campaign", "design1", "more"], "more"),
         ],

@@ -20,7 +20,7 @@ from merge_sumo.scenario.scenario import US23
     ("make", "said"),
     [
         (lambda: load("desgin2"), "did you mean design2"),
-        (lambda: load(""), "name the vehicle under test, as in `vut` design2: careful, "),
+        (lambda: load(""), "no VUT is named: set `vut` to one of careful, "),
         (lambda: make_sampler("unifrom", Pool(levels=(0,), scenario=US23), 0), "mean uniform"),
         (lambda: named_scenario("us23-trafic"), "choose us23"),
     ],
@@ -36,15 +36,15 @@ class TestAWrongSignature:
         [
             (
                 "class V:\n\n    def act(self):\n        return 0.0\n",
-                "act(self) is called as act(self, seen)",
+                "act(self) must accept the call act(self, seen)",
             ),
             (
                 "class V:\n    def act_batch(self, seen): ...\n    def reset(self, seen): ...\n",
-                "reset(self, seen) is called as reset(self, corridor, seen)",
+                "reset(self, seen) must accept the call reset(self, corridor, seen)",
             ),
             (
                 "def V(x, v, *rest, gain):\n    return 0.0\n",
-                "V(x, v, rest, gain) is called as V(seen)",
+                "V(x, v, rest, gain) must accept the call V(seen)",
             ),
         ],
     )

@@ -74,7 +74,7 @@ def test_another_unit_is_refused_in_a_sentence(unit, tmp_path):
     (tmp_path / "text.fmu").write_text("no unit")
     good, other = unit(), unit(names=("a", "b", "c", "d", "e"))
     for spec, said in {
-        tmp_path / "nothing.fmu": "there is no such file",
+        tmp_path / "nothing.fmu": "the file does not exist",
         tmp_path / "text.fmu": "is not a readable FMU",
         other: "has none of the inputs",
         f"{other}?v_vut_mps=d": "has no variable 'acceleration_mps2'; it has a, b, c, d, e",

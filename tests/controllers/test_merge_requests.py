@@ -86,10 +86,10 @@ def test_a_batched_controller_answers_merge_requests_in_a_second_row(write_vut, 
 
 REQUESTS = {"True": MERGE, "0.0": STAY, "np.array(1)": MERGE}
 WRONG = {
-    "(1.0, float('nan'))": "requests nan (float) instead of True or False",
-    "(1.0, 'yes')": "requests 'yes' (str) instead of True or False",
+    "(1.0, float('nan'))": "requested the merge with nan (float) instead of True or False",
+    "(1.0, 'yes')": "requested the merge with 'yes' (str) instead of True or False",
     "('1', True)": "answered '1' (str) instead of a number",
-    "(1.0, True, 2)": "answered (1.0, True, 2) (tuple) instead of a number, or (number, merge)",
+    "(1.0, True, 2)": "answered (1.0, True, 2) (tuple) instead of a number or (number, merge)",
     "Pair((1.0, True))": "ZeroDivisionError: division by zero",
 }
 ANSWERS = """
@@ -122,7 +122,7 @@ def test_another_answer_is_an_error_of_its_own_corridor(write_vut, answer):
     [
         (
             "np.zeros((3, 2))",
-            "shape (3, 2) of float64 instead of 2 numbers, or these and 2 merge requests",
+            "shape (3, 2) of float64 instead of 2 numbers, or 2 numbers and 2 merge requests",
         ),
         ("([1.0, 1.0], ['yes', 'no'])", "of <U"),
     ],
@@ -140,7 +140,7 @@ def test_a_wrong_merge_request_of_a_batch_is_an_error_of_its_own_corridor(write_
     idle = on_lane([-71.0, -90.0, -71.0], [False] * 3)
     idle = idle._replace(active=np.array([True, True, False]))
     assert np.isnan(driver.act(idle)).tolist() == [True, False, False]
-    assert driver.reason(0) == "requests nan instead of 1 or 0, to merge or not"
+    assert driver.reason(0) == "requested the merge with nan instead of 1 or 0"
     assert driver.merge_requests().tolist() == [NO_REQUEST, STAY, NO_REQUEST]
 
 
@@ -151,6 +151,6 @@ _Host._act = lambda host, request: HostReply(accelerations_mps2=[1.0, 1.0], merg
 def Vut(seen):
     return 1.0, True
 """
-    driver, said = begun(write_vut(source), 2, deadline_s=1.0), "broke the channel to its process"
+    driver, said = begun(write_vut(source), 2, deadline_s=1.0), "broke the connection to its"
     with closing(driver), pytest.raises(EpisodesLostError, match=said):
         driver.act(on_lane([-71.0, -71.0], [False, False]))

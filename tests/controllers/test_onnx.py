@@ -50,7 +50,7 @@ def test_one_number_more_is_whether_to_merge_and_is_held_as_the_acceleration(tmp
     wrong = in_process(f"onnx:{network(tmp_path / 'nan.onnx', answer=[0.5, np.inf])}").open(1)
     begin(wrong)
     assert np.isnan(wrong.act(on_lane([-51.0])))[0]
-    assert wrong.reason(0) == "WrongAnswerError: requests inf instead of a number, to merge or not"
+    assert wrong.reason(0) == "WrongAnswerError: requested the merge with inf instead of a number"
 
 
 @pytest.mark.parametrize("shape", [[], ["batch", 1]])
@@ -72,9 +72,9 @@ def test_a_network_with_an_input_seed_is_told_that_of_each_case(tmp_path, kind, 
         ({}, "?decision_period_s=often", "decision_period_s is 'often'"),
         ({}, "?period=1", "it has no parameter 'period': choose from decision_period_s"),
         ({"width": 5}, "", "does not run with the inputs of a VUT"),
-        ({"answer": [0.0, 1.0, 0.0]}, "", "gives 3 numbers"),
+        ({"answer": [0.0, 1.0, 0.0]}, "", "has 3 outputs"),
         ({"seed": (onnx.TensorProto.INT32, [1])}, "", "an int64 (KeyError: 'tensor(int32)')"),
-        ({"answer": [0, 3, 1], "last": "ArgMax"}, "", "gives 3 numbers of type int64"),
+        ({"answer": [0, 3, 1], "last": "ArgMax"}, "", "has 3 outputs of type int64"),
     ],
 )
 def test_a_network_that_cannot_drive_is_refused_in_a_sentence(tmp_path, options, parameter, said):
@@ -86,6 +86,6 @@ def test_a_network_that_cannot_drive_is_refused_in_a_sentence(tmp_path, options,
 
 def test_a_file_that_is_no_network_is_refused(tmp_path):
     (tmp_path / "text.onnx").write_text("text")
-    for name, said in ("nothing", "there is no such file"), ("text", "not a usable ONNX network"):
+    for name, said in ("nothing", "the file does not exist"), ("text", "not a usable ONNX network"):
         with pytest.raises(UserError, match=said):
             in_process(f"onnx:{tmp_path / name}.onnx")

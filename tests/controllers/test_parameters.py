@@ -78,12 +78,12 @@ def test_a_python_controller_takes_keywords_and_attributes(file, named, expected
         ("{}:Vut?nothing=1", "it has no parameter 'nothing': choose from gain, late_m, shift"),
         ("{}:Vut?_hidden=1", "it has no parameter '_hidden'"),
         ("{}:Batch?corridors=3", "it has no parameter 'corridors': choose from gain"),
-        ("{}:Vut?gain=fast", "gain is 'fast': give a number"),
+        ("{}:Vut?gain=fast", "gain is 'fast': it must be a number"),
         ("gap?headway=1", "it has no parameter 'headway': choose from brake_mps2, headway_s"),
-        ("gap?headway_s=-1", "headway_s is -1.0: it must be a number from 0 up"),
+        ("gap?headway_s=-1", "headway_s is -1.0: it must be 0 or more"),
         ("level1?x=1", "it has no parameter 'x': it has none"),
         ("sumo:IDM?taw=1", "it has no parameter 'taw': choose from accel,"),
-        ("sumo:IDM?tau=-1", "tau is -1: give a number from 0 up"),
+        ("sumo:IDM?tau=-1", "tau is -1: it must be 0 or more"),
     ],
 )
 def test_what_is_no_parameter_is_refused_in_a_sentence(file, spec, said):

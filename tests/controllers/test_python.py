@@ -121,7 +121,7 @@ class Vut:
     assert trajectory.end is End.MERGED
     assert said.out == ""
     assert "hello" in said.err
-    assert "closing the VUT: ValueError: too late" in said.err
+    assert "error while closing the VUT: ValueError: too late" in said.err
 
 
 @pytest.mark.parametrize(
@@ -130,7 +130,7 @@ class Vut:
         ("", "Vut", "has no 'Vut'"),
         ("Vut = 3", "Vut", "a VUT is a class or an object"),
         ("class Vut: pass", "Vut", "a VUT is a class or an object"),
-        ("def Vut(): pass", "Vut", "Vut() is called as Vut(seen)"),
+        ("def Vut(): pass", "Vut", "Vut() must accept the call Vut(seen)"),
         ("1 / 0", "Vut", "ZeroDivisionError"),
         ("import sys; sys.exit(1)", "Vut", "SystemExit"),
         ("def Vut(:", "Vut", "SyntaxError"),

@@ -66,7 +66,7 @@ def test_lane_change_parameters_decide_where_it_merges():
     ("spec", "said"),
     [
         ("sumo:idm", "choose one of sumo:Krauss"),
-        ("sumo:IDM?lcAssertive=-2", "lcAssertive is -2: give a number from -1 up"),
+        ("sumo:IDM?lcAssertive=-2", "lcAssertive is -2: it must be -1 or more"),
         ("sumo:IDM?lcPushy=1", "it has no parameter 'lcPushy': choose from"),
         ("sumo:IDM?lcOvertakeDeltaSpeedFactor=3", "Attribute lcOvertakeDeltaSpeedFactor. Must be"),
     ],

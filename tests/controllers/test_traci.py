@@ -194,7 +194,7 @@ SENDS = "s = traci.getConnection()._socket\ns.sendall({!r})\ns.recv(1)"
         ),
         ("traci.vehicle.setSpeed('vut', float('nan'))", "commanded vehicle.setSpeed(nan)"),
         ("traci.simulationStep(float('nan'))", "the controller stepped to time nan"),
-        (SENDS.format(b"\0\0\0\x20\x05"), "sent half a message and no more within the deadline"),
+        (SENDS.format(b"\0\0\0\x20\x05"), "sent only a part of a message within the deadline"),
     ],
     ids=["crashes", "says goodbye", "a huge message", "nan", "time nan", "half a message"],
 )
@@ -214,7 +214,7 @@ def test_a_program_that_does_wrong_is_started_again_and_leaves_nothing(tmp_path,
 @pytest.mark.parametrize(
     ("command", "said"),
     [
-        ("no-such-program {port}", "there is no program 'no-such-program'"),
+        ("no-such-program {port}", "cannot find the program 'no-such-program'"),
         ("'unclosed", "cannot be read"),
         (f"{sys.executable} -c 'raise SystemExit(3)'", "ended with exit code 3 (before it"),
     ],
@@ -227,7 +227,7 @@ def test_a_command_that_cannot_work_is_refused_in_a_sentence(command, said):
 
 def test_a_command_that_never_connects_is_told_how():
     command = f"{sys.executable} -c 'import time; time.sleep(9)'"
-    with pytest.raises(UserError, match=r"in 0\.3 s: the command is told the port as {port}"):
+    with pytest.raises(UserError, match=r"in 0\.3 s: the command receives the port as {port}"):
         run_cases(factory("traci:" + command, connect_s=0.3), cases_of(1))
 
 
@@ -251,7 +251,7 @@ def test_commands_in_vain_are_named_in_the_end(tmp_path, command_line):
     vut = "traci:" + program(tmp_path, STOCK_CLIENT + IN_VAIN)
     campaign = ("--cases", 3, "--sampler", "uniform", "--level", 0, "--workers", 1)
     _, out, _ = command_line("campaign", "--vut", vut, *campaign, "-q", "--out", tmp_path / "run")
-    note = "commanded in vain, because it changes nothing here: vehicle.changeSublane in 3 cases"
+    note = "commands without effect here: vehicle.changeSublane in 3 cases"
     assert f"Note:        {note}" in out.splitlines()
 
 
@@ -262,13 +262,13 @@ def test_output_of_every_start_of_a_program_is_shown(tmp_path, capfd):
 
 
 def test_a_port_that_is_invalid_or_taken_is_refused(capfd):
-    with pytest.raises(UserError, match="the port is a number"):
+    with pytest.raises(UserError, match="the port must be a number"):
         factory("traci:70000")
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = server.getsockname()[1]
         with pytest.raises(UserError, match=f"cannot listen on 127.0.0.1:{port}"):
             run_cases(factory(f"traci:{port}"), cases_of(1))
-    with pytest.raises(UserError, match=r"no TraCI client of yours connected .* in 0.2 s"):
+    with pytest.raises(UserError, match=r"no TraCI client connected .* in 0.2 s"):
         run_cases(factory(f"traci:{free_port()}", connect_s=0.2), cases_of(1))
     assert "waiting up to 0.2 s for a TraCI client on 127.0.0.1:" in capfd.readouterr().err
 

@@ -137,7 +137,7 @@ def test_in_traffic_the_conflicting_car_is_one_that_is_seen():
 
 
 def test_a_vut_of_sumo_takes_no_sensors():
-    with pytest.raises(UserError, match="sees other cars in SUMO itself"):
+    with pytest.raises(UserError, match="reads other cars from SUMO"):
         ms.run("sumo:IDM", x_pov0_m=-250.0, v_pov0_mps=29.0, sense="delay_s=0.1")
 
 
@@ -168,7 +168,7 @@ class TestSettings:
             ("delay=1", "`sense`: sensing has no 'delay': it has "),
             ("delay_s=x", "`sense`: delay_s is 'x': it must be a number or two numbers"),
             ("delay_s=9", "`sense`: delay_s is 9: choose 0 to 5"),
-            ("delay_s=0.5..0.2", "`sense`: delay_s is 0.5..0.2: the first number of a range must"),
+            ("delay_s=0.5..0.2", "`sense`: delay_s is 0.5..0.2: write the lower number of a range"),
         ],
     )
     def test_that_are_wrong_are_refused(self, text, said):

@@ -67,7 +67,7 @@ def test_another_value_is_refused_with_its_field(change, says):
 
 
 def test_a_field_that_is_missing_is_named():
-    with pytest.raises(UserError, match="it has no index"):
+    with pytest.raises(UserError, match="it has no field index"):
         convert({}, Car)
 
 

@@ -40,7 +40,7 @@ def install(tmp_path, monkeypatch):
         ("bad = broken:Tool", "raise SystemExit(1)", "'bad' of broken cannot be loaded"),
         ("bad = broken:Nothing", "", "'bad' of broken cannot be loaded"),
         ("bad = broken:Tool", "Tool = 3", "the tool 'bad' of broken is not a class"),
-        ("ours = broken:Tool", "", "broken and merge-sumo bring a tool 'ours'"),
+        ("ours = broken:Tool", "", "broken and merge-sumo each provide a tool 'ours'"),
     ],
 )
 def test_what_is_no_such_object_is_one_sentence(install, monkeypatch, entry, source, sentence):
@@ -54,12 +54,12 @@ def test_a_name_of_two_packages_names_both(install):
     install("first", "theirs = first:Tool")
     install("second", "theirs = second:Tool")
     assert list(registry()) == ["ours", "other", "theirs"]
-    with pytest.raises(UserError, match="first and second bring a tool 'theirs': uninstall"):
+    with pytest.raises(UserError, match="first and second each provide a tool 'theirs': keep"):
         registry()["theirs"]
 
 
 def test_an_unknown_name_is_one_sentence():
-    with pytest.raises(UserError, match=r"no tool 'our': did you mean ours\? choose one of ours, "):
+    with pytest.raises(UserError, match=r"unknown tool 'our': did you mean ours\? choose one of"):
         registry()["our"]
 
 

@@ -250,7 +250,7 @@ class TestADaskCluster:
     def test_that_is_not_there_is_refused_in_a_sentence(self, monkeypatch):
         pytest.importorskip("distributed", reason="needs merge-sumo[dask]")
         monkeypatch.setattr("merge_sumo.workers.DASK_TIMEOUT_S", 1.0)
-        with pytest.raises(UserError, match=r"no Dask scheduler at tcp://127\.0\.0\.1:1"):
+        with pytest.raises(UserError, match=r"no Dask scheduler answers at tcp://127\.0\.0\.1:1"):
             open_workers("tcp://127.0.0.1:1")
-        with pytest.raises(UserError, match="no Dask scheduler at"):
+        with pytest.raises(UserError, match="no Dask scheduler answers at"):
             dask_workers("nonsense://")

@@ -137,7 +137,7 @@ def test_a_campaign_that_tested_nothing_exits_with_1_and_says_why_first(write_vu
     assert said.exit_code == 1
     assert said.stdout.splitlines()[0].endswith(" on us23: 20 cases, 20 errors, nothing tested")
     assert "\nNot judged:  20 VUT_ERROR, the first in case 0" in said.stdout
-    assert said.stderr.endswith("the VUT reached the merge point without an error in no case\n")
+    assert said.stderr.endswith("the VUT never reached the merge point without an error\n")
     assert "Nothing was tested." in (tmp_path / "run" / "report.html").read_text()
 
 

@@ -89,5 +89,5 @@ def test_what_is_before_it(from_s: float | None, row: int, said: str | None) -> 
 
 @pytest.mark.parametrize("from_s", [0.1, float("nan"), "-3"])
 def test_what_is_not_before_it_is_refused(from_s: Any) -> None:
-    with pytest.raises(UserError, match=r"`from_s` is .*: give a number not above 0, such as -3"):
+    with pytest.raises(UserError, match=r"`from_s` is .*: it must be 0 or below, such as -3"):
         check_from(from_s)

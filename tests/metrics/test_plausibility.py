@@ -20,7 +20,7 @@ class TestDoubts:
             at_limit.append(replace(outcome, measures=Measures(**values)))
         clipped = sum(o.measures.clipped_steps for o in at_limit)
         (note,) = doubts(at_limit, {})
-        assert f"in {clipped} of {sum(rows)} steps the VUT asks for an acceleration" in note
+        assert f"in {clipped} of {sum(rows)} steps the VUT commanded more" in note
         assert doubts(run.outcomes, {}) == []
 
     def test_errors_after_m_are_reported(self, run):
@@ -40,6 +40,6 @@ class TestDoubts:
         code, out, err = command_line("campaign", "--vut", "hard.py:f", *options)
         assert code == 0, err
         (note,) = json.loads(out)["notes"]
-        assert note.startswith("not driven as asked: in ")
-        assert "outside -4 to 2 m/s2" in note
+        assert note.startswith("accelerations were clipped: in ")
+        assert "the limits, -4 to 2 m/s2" in note
         assert note[1:] in Path("run/report.html").read_text()

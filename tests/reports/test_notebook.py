@@ -29,7 +29,7 @@ def test_a_data_frame_has_each_case_at_its_index_and_a_map_its_start(run):
     for verdict, rows in frame[frame.level == 2].groupby("verdict"):
         starts = rows[["x_pov0_m", "v_pov0_mps"]].to_numpy()
         assert drawn[f"{len(rows)} {verdict}"].tolist() == starts.tolist()
-    with pytest.raises(UserError, match=r"no level 3 in .*: it has \[0, 1, 2\]"):
+    with pytest.raises(UserError, match=r"no level 3 in .*: choose from \[0, 1, 2\]"):
         run.plot_map(3)
 
 

@@ -70,7 +70,7 @@ class TestTheWindow:
     def test_is_refused_on_a_road_without_such_a_lane(self, tmp_path):
         build, mainline, ramp = FOREIGN["priority"]
         net = read_net(build(tmp_path))
-        with pytest.raises(UserError, match=r"meet in one point, .* leave lane_m out"):
+        with pytest.raises(UserError, match=r"meet at a point, .* remove lane_m"):
             find_road(net, mainline.split(), ramp.split(), lane_m=LANE_M)
 
 

@@ -99,7 +99,7 @@ def test_lanes_that_cars_may_not_use_are_left_out(tmp_path):
 
 
 def test_a_start_before_the_path_is_refused(built_road):
-    with pytest.raises(UserError, match=r"ramp main_out begins 425.0 m before .* further upstream"):
+    with pytest.raises(UserError, match=r"ramp main_out begins 425.0 m before .* edge upstream"):
         road_for(replace(US23, x_vut0_m=-600.0))
     with (
         SumoSimulation(1, built_road("priority"), scenario=US23) as simulation,
@@ -118,10 +118,10 @@ def straight_net(tmp_path_factory) -> RoadNet:
     [
         ("in out", "r9 out", r"has no edge r9: name edges"),
         ("in out", ":m_0 out", "has no edge :m_0"),
-        ("in", "r0", "never meet: name the edge after the merge point as the last one of both"),
+        ("in", "r0", "never meet: end both with the edge after the merge point"),
         ("out out2", "r1 out", "mainline or ramp begins with edge out, .*: name an edge before it"),
         ("in r1 out", "r0 out", "edge in does not lead to edge r1"),
-        ("in out out2", "r1 out in", "after edge out the mainline goes to out2 and the ramp to"),
+        ("in out out2", "r1 out in", "after edge out the mainline continues on out2 and the ramp"),
     ],
 )
 def test_edges_without_a_merge_are_refused_in_one_sentence(straight_net, mainline, ramp, message):
@@ -160,7 +160,7 @@ def edited(old: str, new: str):
     ("edit", "message"),
     [
         (lambda text: text[:500], "not readable XML"),
-        (lambda text: "<osm/>", "is not a SUMO net: .* netconvert makes a net of a map"),
+        (lambda text: "<osm/>", "is not a SUMO net: .* convert a map with netconvert"),
         (lambda text: "<net/>", "<net> in line 1 has a missing or wrong value .*version"),
         (edited(r'(id="r1_0" .*)length="[\d.]+"', r'\1length="nan"'), "r1_0 has nan, not within"),
         (edited(r'(id="r1_0" .*)shape="[^"]*"', r'\1shape="1,1 1,1"'), "r1_0 has no length"),

@@ -162,9 +162,9 @@ def test_an_odd_net_is_taken_by_every_kind_of_controller_and_export(tmp_path, us
 @pytest.mark.parametrize(
     ("name", "order", "first"),
     [
-        ("priority", 1, "the mainline goes first"),
-        ("priority", -1, "the ramp goes first (are mainline and ramp exchanged?)"),
-        ("zipper", 1, "neither road goes first"),
+        ("priority", 1, "the mainline has priority"),
+        ("priority", -1, "the ramp has priority (did you swap mainline and ramp?)"),
+        ("zipper", 1, "neither road has priority"),
     ],
 )
 def test_a_road_has_its_right_of_way_and_its_limits_after_m(tmp_path, name, order, first):

@@ -41,8 +41,8 @@ def test_points_and_cases_are_inverse_to_each_other(level, coordinates):
     ("change", "sentence"),
     [
         ({"level": 4}, "level is 4"),
-        ({"svo_rad": 0.5}, "svo_rad belongs to level 2"),
-        ({"level": 2}, "svo_rad belongs to level 2"),
+        ({"svo_rad": 0.5}, "svo_rad is for level 2 only"),
+        ({"level": 2}, "svo_rad is for level 2 only"),
         ({"level": 2, "svo_rad": 2.0}, "svo_rad is 2: choose 0 to"),
         ({"x_pov0_m": 5.0}, "x_pov0_m is 5: choose -900 to 0"),
         ({"x_pov0_m": math.nan}, "x_pov0_m is nan"),

@@ -45,14 +45,14 @@ class TestAFile:
     @pytest.mark.parametrize(
         ("line", "said"),
         [
-            ("x_pov0_m = [-180, -340]", "x_pov0_m is -180..-340: the first number of a range"),
+            ("x_pov0_m = [-180, -340]", "x_pov0_m is -180..-340: write the lower number"),
             ("x_pov0_m = -180", "x_pov0_m is -180: it must be two numbers, [low, high]"),
             ("x_pov_m = [-340, -180]", "has no 'x_pov_m': it has "),
             ("reach_m = 300", "x_pov0_m is (-340.0, -180.0): choose starts up to reach_m, 300 m"),
             ("v_vut0_mps = nan", "v_vut0_mps is nan: choose 0 to 100"),
             ("a_min_mps2 = 3", "a_min_mps2 is 3: choose -20 to -0.01"),
             ("dx_crash_m = 20", "dx_crash_m is 20.0: choose up to dx_critical_m"),
-            ("headway_behind_s = [1.0, 4.0]", "(1.0, 4.0): choose both headways, or none"),
+            ("headway_behind_s = [1.0, 4.0]", "(1.0, 4.0): choose both headways or neither"),
             ('mainline = "e1 e2"', "mainline is 'e1 e2': it must be edges"),
         ],
     )
@@ -74,7 +74,7 @@ class TestAFile:
 
     @pytest.mark.parametrize(
         ("content", "said"),
-        [(b"x = [", "is not TOML"), (b"\xff", "not a text in UTF-8"), (None, "No such file")],
+        [(b"x = [", "is not TOML"), (b"\xff", "not UTF-8 text"), (None, "No such file")],
     )
     def test_that_is_none_is_refused(self, tmp_path, content, said):
         if content is not None:
@@ -141,9 +141,9 @@ def test_where_the_learned_drivers_extrapolate_is_said_in_numbers_of_their_train
     assert unseen(SMALLER) == [], "a ramp a tenth shorter and slower is like ours"
     said = unseen(replace(US23, x_vut0_m=-364.0, x_pov0_m=(-680.0, -400.0), a_max_mps2=2.4))
     assert said == [
-        "a_min_mps2 -4 is like -8 in us23 (trained on -4)",
-        "a_max_mps2 2.4 is like 4.8 in us23 (trained on 2)",
-        "level0_a_mps2 1 is like 2 in us23 (trained on 1)",
-        "ttc_min_s 7 is like 3.5 in us23 (trained on 7)",
-        "dx_crash_m 6 is like 3 in us23 (trained on 6)",
+        "a_min_mps2 -4 corresponds to -8 in us23; training used -4",
+        "a_max_mps2 2.4 corresponds to 4.8 in us23; training used 2",
+        "level0_a_mps2 1 corresponds to 2 in us23; training used 1",
+        "ttc_min_s 7 corresponds to 3.5 in us23; training used 7",
+        "dx_crash_m 6 corresponds to 3 in us23; training used 6",
     ]

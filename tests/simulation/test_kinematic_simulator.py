@@ -111,7 +111,7 @@ class TestTheCheck:
             simulation.x_m[VUT] += off_m / 80.0
 
         monkeypatch.setattr(KinematicSimulation, "command", drift)
-        with pytest.raises(UserError, match=r"ends otherwise in SUMO .*: choose `engine` sumo"):
+        with pytest.raises(UserError, match=r"ends differently in SUMO .*: set `engine` to sumo"):
             simulate(plan_for("design1").with_engine("kinematic"), uniform(20, 0))
 
 
@@ -120,7 +120,7 @@ class TestThePlan:
     def test_needs_sumo_for_a_vut_of_others(self, vut):
         plan = plan_for(vut)
         assert plan.with_engine(None).engine is Engine.SUMO
-        with pytest.raises(UserError, match=f"the VUT {vut} is not one of this package"):
+        with pytest.raises(UserError, match=f"the VUT {vut} is not built in"):
             plan.with_engine("kinematic")
 
     def test_needs_sumo_for_a_pov_of_the_user(self):
@@ -128,7 +128,7 @@ class TestThePlan:
         plan = plan_for("design1", povs=povs)
         assert plan.at_level(OWN).with_engine(None).engine is Engine.SUMO
         assert plan.at_level(1).with_engine(None).engine is Engine.KINEMATIC
-        with pytest.raises(UserError, match="the POV design1 is not one of this package"):
+        with pytest.raises(UserError, match="the POV design1 is not built in"):
             plan.with_engine("kinematic")
 
 

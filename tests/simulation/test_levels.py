@@ -33,10 +33,10 @@ def test_are_read_in_their_order(asked, own, levels):
 @pytest.mark.parametrize(
     ("asked", "own", "said"),
     [
-        ("0,3", False, "there is no POV level '3': choose 0, 1, 2, all, or own"),
-        ([], False, "there is no POV level ''"),
-        ("0,all", False, "there is no POV level 'all'"),
-        ("0,own", False, "there is no POV level own: choose 0, 1, 2, all, or own with `pov`"),
+        ("0,3", False, "unknown POV level '3': choose 0, 1, 2, all, or own"),
+        ([], False, "unknown POV level ''"),
+        ("0,all", False, "unknown POV level 'all'"),
+        ("0,own", False, "unknown POV level own: choose 0, 1, 2, all, or own with `pov`"),
         ("1,0", True, "`pov` drives at `level` own or all, not at `level` 1,0"),
     ],
 )
@@ -52,5 +52,5 @@ def test_two_are_tested_and_run_again(tmp_path):
     assert sum(row["cases"] for row in again["steps"][0]["transitions"]) == 20
     with pytest.raises(UserError, match="has no cases at level '2': it has 0, 1, or all"):
         ms.rerun(run, level="0,2")
-    with pytest.raises(UserError, match="`level` 0,1 does not go here: choose one level"):
+    with pytest.raises(UserError, match="`level` 0,1 is not possible here: choose one level"):
         ms.run("design1", level="0,1", x_pov0_m=-200.0, v_pov0_mps=30.0)

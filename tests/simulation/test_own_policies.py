@@ -74,7 +74,7 @@ def test_commands_refuse_anything_but_a_folder_of_policies(call, command, tmp_pa
     (tmp_path / "empty").mkdir()
     before = sorted(tmp_path.iterdir())
     for named in ("nowhere", "file", "empty", "/dev/null"):
-        assert_refused(call(*command, "--policies", named), "name a folder of policies")
+        assert_refused(call(*command, "--policies", named), "choose a folder that")
     assert sorted(tmp_path.iterdir()) == before
 
 
@@ -118,8 +118,8 @@ class TestAFolder:
             ({"1.weight": np.zeros((ACTIONS, 9))}, "1.weight is (7, 9)"),
             ({"0.weight": np.zeros((8, FEATURES), dtype=np.int64)}, "of int64"),
             ({"a_min_mps2": np.zeros((2, 2))}, "can only convert an array of size 1"),
-            ({"a_min_mps2": np.zeros(1)}, "its limit of braking is not from -20 to below 0"),
-            ({"2.weight": np.zeros((7, 7))}, "and not 0.weight, 0.bias, ..."),
+            ({"a_min_mps2": np.zeros(1)}, "its braking limit is not from -20 to below 0"),
+            ({"2.weight": np.zeros((7, 7))}, "instead of 0.weight, 0.bias, ..."),
             ({"0.weight": np.zeros((8, 3), np.float32)}, "(outputs, 26) and (outputs,)"),
         ],
     )
@@ -133,7 +133,7 @@ class TestAFolder:
         write_network(folder, "vut1", tensors | changed)
         asked = ("--vut", "level1", "--level", "1", "--cases", 4, "--policies", folder)
         result = call("campaign", *asked, "--out", tmp_path / "run")
-        assert_refused(result, "vut1.safetensors holds no action-value network: ", said)
+        assert_refused(result, "vut1.safetensors is not an action-value network: ", said)
         assert not (tmp_path / "run").exists()
 
     @pytest.mark.parametrize(("name", "end"), [("pov1", End.SIM_ERROR), ("vut1", End.VUT_ERROR)])
@@ -151,5 +151,5 @@ class TestAFolder:
     def test_that_a_worker_does_not_have_is_said_in_a_sentence(self, folder):
         plan = plan_for("design1", corridors=2, povs=Povs(policies=folder))
         shutil.rmtree(folder)
-        with open_workers(1) as workers, pytest.raises(UserError, match="put the same files there"):
+        with open_workers(1) as workers, pytest.raises(UserError, match="copy the files of this"):
             open_simulators(plan, workers)

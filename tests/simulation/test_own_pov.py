@@ -153,10 +153,10 @@ class TestACampaign:
         [
             (
                 ("--level", "own"),
-                "no POV level own: choose 0, 1, 2, all, or own with --pov",
+                "unknown POV level own: choose 0, 1, 2, all, or own with --pov",
             ),
-            (("--pov", "traci"), "a TraCI client drives the vehicle named vut and no other"),
-            (("--pov", "level1"), "the POVs of levels 0 to 2 need no name"),
+            (("--pov", "traci"), "a TraCI client drives only the vehicle vut"),
+            (("--pov", "level1"), "the POVs of levels 0 to 2 are built in"),
             (("--pov", "nowhere.py:Pov"), "the POV nowhere.py:Pov: cannot"),
         ],
     )

@@ -71,7 +71,7 @@ class TestKills:
         bad = sum(outcome.case.v_pov0_mps > 33.0 for outcome in calm.outcomes)
         assert struck.settings.ran_again >= bad
         assert json.loads((struck.folder / SETTINGS).read_text())[RAN_AGAIN] >= bad
-        assert "cases ran again, because a process was killed" in struck.ran_again_in_words
+        assert "cases ran again after a process was killed" in struck.ran_again_in_words
 
     @pytest.mark.slow
     def test_while_a_vut_is_opened_do_not_end_the_campaign(self, campaign, calm):
@@ -83,5 +83,5 @@ if not flag.exists():
     os.kill(os.getpid(), signal.SIGKILL)
 """
         assert outcomes(campaign("once", once + CALM)) == outcomes(calm)
-        with pytest.raises(UserError, match=r"opening the VUT .* by signal 9 \(SIGKILL\)"):
+        with pytest.raises(UserError, match=r"loading the VUT .* by signal 9 \(SIGKILL\)"):
             campaign("always", f"import os, signal\n{KILLED}\n{CALM}")

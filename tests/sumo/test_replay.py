@@ -148,7 +148,7 @@ class TestAReplayThatIsNotTheRecord:
         record.write(folder / RECORD)
         result = replay(folder)
         assert result.diverged_at_s == ROW * DT_S
-        assert result.detail == "pov is recorded as not moving at its speed"
+        assert result.detail == "the recorded motion of pov does not match its speed"
 
     def test_diverges_where_the_end_is_not_held(self, folder):
         record = etree.parse(folder / RECORD)

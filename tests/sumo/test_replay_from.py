@@ -85,4 +85,4 @@ class TestTheCommand:
     @pytest.mark.parametrize("number", ["3", "nan", "-inf"])
     @pytest.mark.parametrize("command", [("replay", STALEMATE), ("run",)])
     def test_refuses_another_number(self, command, number, command_line):
-        assert_refused(command_line(*command, "--from", number), "--from", "not above 0, such as")
+        assert_refused(command_line(*command, "--from", number), "--from", "0 or below, such as")

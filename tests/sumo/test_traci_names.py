@@ -93,7 +93,7 @@ class TestSubscriptions:
         assert pair.session.subscriptions == {}
 
     def test_to_other_objects_around_it_are_refused(self, pair):
-        with pytest.raises(traci.TraCIException, match="context subscriptions to vehicles alone"):
+        with pytest.raises(traci.TraCIException, match="context subscriptions to vehicles only"):
             pair.ours.vehicle.subscribeContext("vut", 0xA3, 100.0, [1])
 
     def test_to_vehicles_around_it_follow_the_steps(self, pair):

@@ -103,7 +103,7 @@ CATALOGUE = {
             except OSError:
                 pass
         """,
-        "broke the channel to its process",
+        "broke the connection to its process",
     ),
     "closes all descriptors": acts("import os; os.closerange(0, 4096)", "exit code 1"),
     "changes directory": acts("import os; os.chdir('/')"),

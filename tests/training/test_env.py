@@ -30,18 +30,18 @@ def no_screen(monkeypatch):
 def test_anything_but_an_action_is_refused(action):
     game = MergeEnv("vut")
     game.reset(seed=1)
-    with pytest.raises(UserError, match="an action is a whole number from 0 to 6: not"):
+    with pytest.raises(UserError, match="an action must be a whole number from 0 to 6, not"):
         game.step(action)
 
 
 @pytest.mark.parametrize(
     ("settings", "sentence"),
     [
-        ({"role": "bus"}, "a bus cannot play against 'level0': `role` is pov or vut"),
+        ({"role": "bus"}, "a bus cannot play against 'level0': `role` must be pov or vut"),
         ({"role": "vut", "svo": 0.5}, "svo is 0.5: .* for a POV"),
         ({"opponent": "pov1"}, "cannot play against 'pov1'"),
-        ({"opponent": "vut1", "svo": "selfish"}, "svo is .*: choose 'random', or 0 up to"),
-        ({"opponent": "vut1", "svo": float("nan")}, "svo is .*: choose 'random', or 0 up to"),
+        ({"opponent": "vut1", "svo": "selfish"}, "svo is .*: choose 'random', or for a POV"),
+        ({"opponent": "vut1", "svo": float("nan")}, "svo is .*: choose 'random', or for a POV"),
     ],
 )
 def test_wrong_settings_are_refused(settings, sentence):

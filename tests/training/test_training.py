@@ -242,7 +242,7 @@ class TestTraining:
         limited: dict[str, Any] = {"scenario": LIKE_A_ROUNDABOUT, "a_min_mps2": -2.0}
         said: list[str] = []
         train_library(folder, ("pov1",), **limited, say=said.append)
-        assert said == ["pov1 is there already"]
+        assert said == ["pov1 exists already"]
         for other in ({"a_min_mps2": None}, {"a_min_mps2": -1.0}, {"seed": 1}, {"scenario": US23}):
             with pytest.raises(UserError, match=r"has a pov1 of another .*`out`"):
                 train_library(folder, ("pov1",), **limited | other)
@@ -251,7 +251,7 @@ class TestTraining:
     def test_the_drivers_know_the_scenario_and_the_shipped_ones_do_not(self, trained, ring):
         assert unseen(LIKE_A_ROUNDABOUT, trained[0]) == []
         said = invoke("scenario", "check", ring).output
-        assert "a_min_mps2 -4 is like -8.51 in us23 (trained on -4)" in said
+        assert "a_min_mps2 -4 corresponds to -8.51 in us23; training used -4" in said
         assert f"merge-sumo train --scenario {ring} --out ring-policies" in said
 
     def test_a_check_measures_the_regret_on_the_scenario(self, trained, ring):
@@ -269,7 +269,7 @@ class TestTraining:
 
 @pytest.mark.parametrize("a_min_mps2", [0.0, -4.5, float("nan")])
 def test_a_limit_outside_that_of_the_scenario_is_refused(tmp_path, a_min_mps2):
-    with pytest.raises(UserError, match="choose with `a_min` a number from -4 to below 0"):
+    with pytest.raises(UserError, match="choose a number from -4 to below 0"):
         train_library(tmp_path / "new", scenario=US23, a_min_mps2=a_min_mps2)
     assert not (tmp_path / "new").exists()
 

@@ -87,7 +87,7 @@ class Reader:
             count: their number.
         """
         if not 0 <= count <= self.left:
-            raise ProtocolError(f"{count} bytes were announced where {self.left} are left")
+            raise ProtocolError(f"{count} bytes were announced, but {self.left} are left")
         start, self._at = self._at, self._at + count
         return self._data[start : self._at]
 
@@ -143,7 +143,7 @@ class Reader:
     def _length(self) -> int:
         length: int = self.value("i")
         if not 0 <= length <= self.left:
-            raise ProtocolError(f"{length} items were announced where {self.left} bytes are left")
+            raise ProtocolError(f"{length} items were announced, but {self.left} bytes are left")
         return length
 
 
@@ -275,7 +275,7 @@ def packed(function: str, answer: Any) -> bytes:
             return compound(len(answer), content)
         return pack("p" if name in POLYGONS else _form_of(answer), answer)
     except (TypeError, ValueError, AttributeError, struct.error) as error:
-        raise ProtocolError("its answer has no form here") from error
+        raise ProtocolError("the type of its answer is not supported") from error
 
 
 def _form_of(answer: Any) -> str:

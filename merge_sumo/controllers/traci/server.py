@@ -88,7 +88,7 @@ class ServerProcess(ChildProcess):
             UserError: if it cannot be started.
         """
         if os.name != "posix":
-            raise UserError("a controller by TraCI needs Linux or macOS")
+            raise UserError("a TraCI controller needs Linux or macOS")
         no_warnings = Path(os.devnull)
         super().__init__(f"{__name__}:{main.__name__}", {}, sumo_environment(), no_warnings)
         write_files(Path(self.folder.name), road, scenario)
@@ -112,7 +112,7 @@ class ServerProcess(ChildProcess):
         if client is not None:
             with suppress(OSError):  # the process is gone
                 send_handle(self._socket, client.fileno(), self._process.pid)
-        content = self.receive(patience_s, "took too long for a question")
+        content = self.receive(patience_s, "took too long to answer")
         reply = msgspec.msgpack.decode(content, type=Reply)
         if reply.refused:
             self.kill()
@@ -252,7 +252,7 @@ class Server:
                 self._do(command)
             except ProtocolError as error:
                 raise FaultError(
-                    f"the controller sent command 0x{command.identifier:02x} that is not TraCI: "
+                    f"the controller sent the invalid TraCI command 0x{command.identifier:02x}: "
                     f"{error}"
                 ) from error
             except NotFiniteError as error:
@@ -295,13 +295,13 @@ class Server:
         try:
             self._client.sendall(content)
         except OSError as error:
-            raise FaultError(f"the controller took no answer: {error}") from error
+            raise FaultError(f"the controller did not read the answer: {error}") from error
 
     def _receive(self, until: float) -> list[Command]:
         """Return the commands of a message that comes before a time."""
         try:
             length = message_length(self._read(4, until, "made no step"))
-            return commands_of(self._read(length, until, "sent half a message and no more"))
+            return commands_of(self._read(length, until, "sent only a part of a message"))
         except ProtocolError as error:
             raise FaultError(f"the controller sent bytes that are not TraCI: {error}") from error
 

@@ -283,7 +283,7 @@ class Session:
         is_context = identifier - CONTEXT in QUESTIONS
         domain = getter = identifier - (CONTEXT if is_context else SUBSCRIBE)
         if getter not in QUESTIONS:
-            raise RefusedError(f"merge-sumo does not carry out the command 0x{identifier:02x}")
+            raise RefusedError(f"merge-sumo does not support the command 0x{identifier:02x}")
         reader.raw(16)  # its begin and its end: it holds until it is ended
         name, range_m = reader.value("s"), None
         if is_context:
@@ -345,7 +345,7 @@ class Session:
         elif letter.islower():
             function, arguments = "convertGeo", [*place[:2], PLACES[kind] in "gG"]
         else:
-            raise ProtocolError(f"coordinates of type {target} do not exist")
+            raise ProtocolError(f"unknown type of coordinates: {target}")
         return pack(letter, self.sumo.call(f"simulation.{function}", *arguments))
 
     def _on_road(self, position: Position) -> list[Any]:
@@ -417,13 +417,15 @@ class Session:
     def _around(self, subject: Subject, range_m: float) -> list[str]:
         """Return the vehicles that are at most `range_m` away from an object."""
         if subject.domain != GET_VEHICLE:
-            raise RefusedError("there are context subscriptions to vehicles alone")
+            raise RefusedError("merge-sumo supports context subscriptions to vehicles only")
         if subject.getter == GET_VEHICLE:
             point = self.position(subject.name)
         elif subject.getter == GET_JUNCTION:
             point = self.sumo.call("junction.getPosition", subject.name)
         else:
-            raise RefusedError("there are context subscriptions of vehicles and junctions")
+            raise RefusedError(
+                "merge-sumo supports context subscriptions of vehicles and junctions"
+            )
         # SUMO may still have them where they were before they were put back.
         found = []
         for other in sorted(self.sumo.at_m):
@@ -439,9 +441,7 @@ class Session:
         names = functions().get((setter, variable), ())
         name, effect = name_of(setter, variable), effect_of(names)
         if effect is Effect.REFUSED:
-            raise RefusedError(
-                f"merge-sumo does not carry out {name}: the scenario and the campaign decide it"
-            )
+            raise RefusedError(f"merge-sumo refuses {name}: the scenario and the campaign set it")
         if setter == SET_VEHICLE:
             self._check_vehicle(target)
         arguments = reader.arguments()
@@ -455,7 +455,7 @@ class Session:
         if is_in_vain or effect is Effect.LOOKS:
             return
         if target not in (VUT_ID, OWN_TYPE):
-            raise RefusedError(f"{target!r} is not the controller's to command")
+            raise RefusedError(f"the controller may not command {target!r}")
         function = names[-1]
         numbers = [value for value in arguments if isinstance(value, float)]
         self._check_numbers(function, numbers)
@@ -492,7 +492,7 @@ class Session:
     def _reach(self, function: str, numbers: Sequence[float]) -> None:
         """Take the speed, or the place (x, y), that the VUT has at the end of the coming step."""
         if len(numbers) < (2 if function == "vehicle.moveToXY" else 1):
-            raise RefusedError(f"{function} was given no number")
+            raise RefusedError(f"{function} needs a number")
         if function == "vehicle.setPreviousSpeed":
             if numbers[0] < 0.0:
                 raise RefusedError("Previous speed must not be negative.")
@@ -506,8 +506,8 @@ class Session:
         away_m, x_m, number = min(found)
         if not away_m <= OFF_THE_LANE_M:
             raise RefusedError(
-                f"{function} takes points up to {OFF_THE_LANE_M} m from the lane of the VUT: "
-                f"this one is {away_m:.4g} m away"
+                f"{function} takes points up to {OFF_THE_LANE_M} m from the lane of the VUT: this "
+                f"point is {away_m:.4g} m away"
             )
         before_m = self._last_place.x_m if self._last_place else self.sumo.at_m[VUT_ID]
         self._next_place = _Place((x_m - before_m) / DT_S, x_m, (x, y), number > 0)

@@ -60,17 +60,14 @@ class TraciKind(ControllerKind):
     """
 
     form = "traci:COMMAND or traci[:PORT]"
-    what = (
-        "a program in any language that drives `vut` by TraCI; started by you where no command is "
-        "given"
-    )
+    what = "a program in any language that drives `vut` by TraCI; without a command, you start it"
     example = '--vut "traci:python my_controller.py {port}"'
     has_parameters, files_are_known = False, False
     no_parameters = "a TraCI client is a program with parameters of its own"
     max_corridors = 1
     no_pov = (
-        "a TraCI client drives the vehicle named vut and no other; bring the POV as Python, an "
-        "FMU, a network or sumo:MODEL"
+        "a TraCI client drives only the vehicle vut; choose a POV in Python, an FMU, a network or "
+        "sumo:MODEL"
     )
 
     def load(self) -> None:
@@ -84,7 +81,7 @@ class TraciKind(ControllerKind):
         if self.waits(argument):
             self.port = int(argument or DEFAULT_PORT)
             if not 1 <= self.port <= 65535:
-                raise UserError(f"{self.spec}: the port is a number from 1 to 65535")
+                raise UserError(f"{self.spec}: the port must be a number from 1 to 65535")
             self.max_workers = 1
         else:
             self.command = split_command(argument)
@@ -112,7 +109,7 @@ class TraciKind(ControllerKind):
             UserError: without one, or if no client connects in time.
         """
         if not isinstance(simulation, SumoSimulation):
-            raise UserError(f"{self.spec} drives in a SUMO simulation only")
+            raise UserError(f"{self.spec} drives only in a SUMO simulation")
         return TraciDriver(self, simulation.road, simulation.scenario)
 
 
@@ -252,7 +249,7 @@ class TraciDriver(ControllerDriver):
         try:
             reply = self._server.request(action, patience_s, **values)
         except ProcessDiedError as died:
-            reason = f"the SUMO that answers the controller {died}"
+            reason = f"SUMO, which answers the controller, stopped: {died}"
             # Killed from outside, or by a question of the client: the case runs again, which shows.
             self._disconnect()
             raise EpisodesLostError(reason) from died
@@ -293,11 +290,11 @@ class TraciDriver(ControllerDriver):
                     f"waiting up to {patience_s:g} s for a TraCI client on {HOST}:{port}\n"
                 )
             if not self._accept(patience_s):
-                reason = f"no TraCI client of yours connected to {HOST}:{port} in {patience_s:g} s"
+                reason = f"no TraCI client connected to {HOST}:{port} in {patience_s:g} s"
                 if self._program is not None:
                     reason += (
-                        ": the command is told the port as {port} and in MERGE_SUMO_PORT, for "
-                        "traci.init(PORT) or traci.start(..., port=PORT)"
+                        ": the command receives the port as {port} and in MERGE_SUMO_PORT; pass it "
+                        "to traci.init(PORT) or traci.start(..., port=PORT)"
                     )
                     if ended := self._program.ended(0.0):
                         reason = f"{ended} (before it connected)"
