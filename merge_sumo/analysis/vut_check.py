@@ -165,7 +165,9 @@ def _standstill_faults(simulator: Simulator, from_standstill: Case) -> list[str]
     """Return a sentence on a VUT that does not drive off, if it does not."""
     (driven,) = simulator.run([from_standstill])
     if driven.end.is_error:
-        return [f"From standstill: VUT_ERROR at t = {driven.t_end_s} s: {driven.error}"]
+        return [
+            f"From standstill the VUT ends as VUT_ERROR at t = {driven.t_end_s} s: {driven.error}"
+        ]
     if driven.end is End.TIMEOUT and not driven.v_vut_mps.any():
         return ["From standstill the VUT never starts, although the road becomes free."]
     return []

@@ -73,8 +73,8 @@ def parse_condition(
         return _Parser(vocabulary, what, named).condition(tree), written
     except (SyntaxError, ValueError, MemoryError, RecursionError) as error:
         raise UserError(
-            f"{what} is not a condition over measures: write comparisons, and, or, not as in "
-            "Python, such as 'ttc_s < 1.5 or end == \"TIMEOUT\"'"
+            f"{what} is not a condition over measures: write comparisons joined by and, or, not "
+            "as in Python, such as 'ttc_s < 1.5 or end == \"TIMEOUT\"'"
         ) from error
 
 
@@ -108,7 +108,9 @@ class _Parser:
                 return self.condition(ast.parse(self._named[name], mode="eval").body)
             case ast.Name(id=name) if name not in self._vocabulary:
                 raise self._unknown(name)
-        raise self._error("is not a condition: write comparisons, and, or, not, brackets", node)
+        raise self._error(
+            "is not a condition: write comparisons joined by and, or, not, with brackets", node
+        )
 
     def _comparison(self, first: ast.expr, sign: ast.cmpop, second: ast.expr) -> Condition:
         left, right = self._side(first), self._side(second)

@@ -69,7 +69,7 @@ def test_of_a_good_vut_it_says_nothing_wrong_and_what_a_step_costs(check):
             "mixes the corridors of `act_batch`",
         ),
         ("def Vut(seen):\n    return None\n", "16 of 16 ordinary cases end as VUT_ERROR"),
-        ("def Vut(seen):\n    return 1.0 / seen.v_vut_mps\n", "From standstill: VUT_ERROR"),
+        ("def Vut(seen):\n    return 1.0 / seen.v_vut_mps\n", "From standstill the VUT ends as"),
         ("def Vut(seen):\n    return 0.1 * (seen.v_vut_mps > 1)\n", "the VUT never starts"),
         (
             "class Vut:\n    def __init__(self):\n        raise ValueError('no licence')\n"

@@ -98,7 +98,7 @@ def test_nothing_at_the_place_of_an_output_is_touched(cwd, no_cases, command_lin
     if writer == "export cases":
         wrong.remove("changes")  # that is a folder
     for name in wrong:
-        assert_refused(command_line(*words, name), f"end it in {suffix}")
+        assert_refused(command_line(*words, name), f"must end in {suffix}")
     for name in (*REFUSED, *TOO_LONG):
         assert_refused(command_line(*words, name))
     assert tree(cwd) == before

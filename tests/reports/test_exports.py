@@ -141,5 +141,5 @@ def test_a_cases_file_of_more_says_how_many_it_has(tmp_path):
     run = write_run(tmp_path / "run", per_level=15)
     with pytest.warns(Notice, match="^the file has 40 of 45 cases"):
         ms.export(run.folder, file_format="cases", out=tmp_path / "cases.toml")
-    with pytest.raises(UserError, match=r"end it in \.csv"):
+    with pytest.raises(UserError, match=r"must end in \.csv"):
         ms.export(run.folder, file_format="csv", out=tmp_path / "table.txt")
