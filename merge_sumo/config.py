@@ -260,8 +260,8 @@ class Levels:
     level: AnyLevels = "all"
     """POV levels, separated by commas: 0, 1, 2, or own (the driver of --pov).
 
-    Level 0 ignores the VUT. Level 1 makes room for a VUT that accelerates. Level 2 expects a VUT
-    that reacts. The level own is the driver of --pov.
+    Level 0 ignores the VUT. Level 1 assumes that the VUT accelerates, and makes room. Level 2
+    assumes that the VUT reacts.
     """
 
 
@@ -367,10 +367,7 @@ class Resume(CampaignCalls):
     """
 
     run: AnyRun
-    """Run folder of the campaign.
-
-    In Python, also the campaign itself.
-    """
+    """Run folder of the campaign."""
     _: KW_ONLY
     vut: AnyVut | None = None
     """The VUT again, if it is your own code."""
@@ -445,10 +442,7 @@ class Probability(EngineChoice, StudyOptions):
     """
 
     run: AnyRun
-    """Run folder of the campaign.
-
-    In Python, also the campaign itself.
-    """
+    """Run folder of the campaign."""
     _: KW_ONLY
     cases: int | None = None
     """Number of new cases. [default: 100000; with --engine sumo: 4000]"""
@@ -484,10 +478,7 @@ class Explain(StudyOptions):
     """
 
     run: AnyRun
-    """Run folder of the campaign.
-
-    In Python, also the campaign itself.
-    """
+    """Run folder of the campaign."""
     case: int | None = None
     """Index of the failure in outcomes.jsonl. [default: the worst failure]"""
     _: KW_ONLY
@@ -503,10 +494,7 @@ class Export:
     """
 
     run: AnyRun
-    """Run folder of the campaign.
-
-    In Python, also the campaign itself.
-    """
+    """Run folder of the campaign."""
     indices: Indices | None = None
     """Indices of the cases. [default: all for csv, up to 40 for cases]
 
@@ -555,10 +543,7 @@ class Report:
     """
 
     run: AnyRun
-    """Run folder of the campaign.
-
-    In Python, also the campaign itself.
-    """
+    """Run folder of the campaign."""
 
 
 # Change
@@ -589,10 +574,7 @@ class Rerun(Page, Levels, StudyOptions):
     """
 
     run: AnyRun
-    """Run folder of the campaign, or a cases file.
-
-    In Python, also the campaign itself.
-    """
+    """Run folder of the campaign, or a cases file."""
     indices: Indices = ()
     """Indices of the cases. [default: all cases]"""
 
@@ -605,10 +587,7 @@ class Stress(StudyOptions):
     """
 
     run: AnyRun
-    """Run folder of the campaign.
-
-    In Python, also the campaign itself.
-    """
+    """Run folder of the campaign."""
 
 
 @dataclass(frozen=True)

@@ -131,7 +131,7 @@ def parse_levels(asked: AnyLevels, policies: Path, *, own: bool) -> tuple[int, .
 
 
 def check_level(level: int, available: Collection[int], policies: Path) -> None:
-    """Raise `UserError` where there is no POV of a level.
+    """Raise `UserError` if a level does not have a POV.
 
     Args:
         level: the level.
