@@ -406,7 +406,7 @@ class SeenBatch:
 
     Attributes:
         active: whether an episode runs in the corridor; if not, its numbers have no meaning.
-        t_s: time since the begin of the episode, in s.
+        t_s: time since the beginning of the episode, in s.
         x_pov_m: position of the POV's front bumper, in m; 0 at M, negative before M.
         v_pov_mps: speed of the POV, in m/s.
         x_vut_m: position of the VUT's front bumper, in m; 0 at M, negative before M.

@@ -1,6 +1,6 @@
 """Requirements over time: signal temporal logic over the signals of an episode, by rtamt.
 
-A formula has to hold, such as `always (v_vut_mps > 2)`. Its robustness at the begin of the episode
+A formula has to hold, such as `always (v_vut_mps > 2)`. Its robustness at the beginning of the episode
 (Donze and Maler, 2010) is above 0 where it holds, in the units of the signals. rtamt (Nickovic and
 Yamaguchi, 2020) imports modules that a formula names: only known words and signs reach it.
 """
@@ -136,7 +136,7 @@ def signals(trajectory: Trajectory) -> dict[str, FloatArray]:
 
 
 def robustness(text: str, trajectory: Trajectory) -> float:
-    """Return the robustness of a formula at the begin of an episode: finite, and never 0.
+    """Return the robustness of a formula at the beginning of an episode: finite, and never 0.
 
     Args:
         text: a checked formula.

@@ -53,7 +53,7 @@ class _Bar:
 class Bars:
     """Progress bars by title; a bar appears with its first update.
 
-    Without a terminal, they print a line at the begin, every minute, and at the end.
+    Without a terminal, they print a line at the beginning, every minute, and at the end.
 
     Example:
         >>> with Bars() as bars:

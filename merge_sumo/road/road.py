@@ -28,7 +28,7 @@ class LanePoint(NamedTuple):
 
     Attributes:
         lane: id of the lane.
-        position_m: distance from the begin of the lane.
+        position_m: distance from the beginning of the lane.
         x_m: eastward coordinate in the net.
         y_m: northward coordinate in the net.
         angle_deg: heading in SUMO's convention: degrees clockwise from north.
@@ -75,7 +75,7 @@ class Piece:
         """Return where SUMO draws a position on the lane.
 
         Args:
-            position_m: distance from the begin of the lane.
+            position_m: distance from the beginning of the lane.
 
         Returns:
             x and y in m, and the heading in degrees clockwise from north.

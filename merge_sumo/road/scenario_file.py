@@ -93,7 +93,7 @@ COMMENTS = {
     "level0_v_mps": "speed up to which it accelerates",
     "reach_m": "no vehicle starts farther from M",
     "v_start_max_mps": "no vehicle starts faster",
-    "lane_m": "begin and end of the acceleration lane; the begin is at the gore or after it",
+    "lane_m": "begin and end of the acceleration lane; the beginning is at the gore or after it",
     "lane_end": 'at its end the VUT moves to the mainline; with "stop" it must stop before it',
 }
 """Comments on the values of a file that is written."""
@@ -104,7 +104,7 @@ def to_toml(scenario: Scenario, notes: Sequence[str]) -> str:
 
     Args:
         scenario: the scenario.
-        notes: lines of a comment at the begin of the file.
+        notes: lines of a comment at the beginning of the file.
     """
     lines = [f"# {line}" for line in notes]
     lines.append("")

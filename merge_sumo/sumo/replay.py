@@ -162,7 +162,7 @@ def open_gui(folder: Path, from_s: float | None = None, *, silent: bool = False)
     Args:
         folder: the replay folder.
         from_s: begin before the first conflict, as in `replay`.
-        silent: whether to print no notice of the begin.
+        silent: whether to print no notice of the beginning.
 
     Raises:
         UserError: sumo-gui failed, or the folder is not a replay folder.

@@ -284,7 +284,7 @@ class Session:
         domain = getter = identifier - (CONTEXT if is_context else SUBSCRIBE)
         if getter not in QUESTIONS:
             raise RefusedError(f"merge-sumo does not support the command 0x{identifier:02x}")
-        reader.raw(16)  # its begin and its end: it holds until it is ended
+        reader.raw(16)  # its beginning and its end: it holds until it is ended
         name, range_m = reader.value("s"), None
         if is_context:
             domain, range_m = reader.value("B"), reader.value("d")
