@@ -1,8 +1,9 @@
 """Requirements over time: signal temporal logic over the signals of an episode, by rtamt.
 
-A formula has to hold, such as `always (v_vut_mps > 2)`. Its robustness at the beginning of the episode
-(Donze and Maler, 2010) is above 0 where it holds, in the units of the signals. rtamt (Nickovic and
-Yamaguchi, 2020) imports modules that a formula names: only known words and signs reach it.
+A formula has to hold, such as `always (v_vut_mps > 2)`. Its robustness at the beginning of the
+episode (Donze and Maler, 2010) is above 0 where it holds, in the units of the signals. rtamt
+(Nickovic and Yamaguchi, 2020) imports modules that a formula names: only known words and signs
+reach it.
 """
 
 from __future__ import annotations
