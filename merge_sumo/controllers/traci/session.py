@@ -304,9 +304,11 @@ class Session:
                 return packed(function, own)
             if function == "simulation.convert2D":
                 return self._conversion(reader)
-            arguments = reader.arguments()
             if function == "vehicle.getDrivingDistance":
-                arguments = self._on_road(arguments[0])
+                reader.raw(5)  # type and size of the compound; its last byte has no type
+                arguments = self._on_road(reader.typed())
+            else:
+                arguments = reader.arguments()
             if name and not function.endswith(("getIDList", "getIDCount")):
                 arguments = [name, *arguments]
             return packed(function, self.sumo.call(function, *arguments))
