@@ -215,7 +215,7 @@ def campaign(
     *,
     resume: Annotated[
         Path | None,
-        Parameter(help="Continue the campaign in this folder. --cases may be larger."),
+        Parameter(help="Continue the campaign in this folder. A larger --cases adds cases."),
     ] = None,
     out: Annotated[
         Path | None,
@@ -253,7 +253,7 @@ def run(
     vut: Annotated[
         str | None,
         Parameter(
-            help="Vehicle under test, as in `campaign`. With --case, only for your own code."
+            help="Vehicle under test, as in `campaign`. With --case, needed only for your own code."
         ),
     ] = None,
     config: Options[c.CaseOptions] = c.CaseOptions(),
@@ -358,7 +358,7 @@ def rerun(
     stress: Annotated[
         bool,
         Parameter(
-            help="""Run each case with small changes of the simulation, to find robust failures.
+            help="""Run each case with small changes of the simulation. Which failures remain?
 
             A failure is robust if it fails with each change: a shorter step, an actuator with a
             lag, limited power, a start with the error of a sensor, and longer cars.""",

@@ -79,7 +79,7 @@ class Policies:
     """Drivers."""
 
     policies: AnyPath | None = None
-    """Folder of learned POV drivers, or a shipped library such as human.
+    """Learned POV drivers: a folder, or a shipped set: human or roundabout.
 
     `merge-sumo train --out FOLDER` writes such a folder. By default it is the shipped library for
     the scenario, or else the one for us23.
@@ -104,7 +104,7 @@ class Drivers(Limits, Policies):
     """Drivers and limits of controllers."""
 
     pov: AnyVut | None = None
-    """Your own POV, which drives at level own.
+    """Your own driver of the POV, for --level own.
 
     It can be of any kind that --vut takes, except traci.
     """
@@ -188,7 +188,7 @@ class Search:
     batch: int | None = None
     """Cases per batch. [default: chosen by the sampler]"""
     in_flight: int | None = None
-    """Keep this number of cases running or waiting, instead of batches.
+    """Do not wait for batches: keep this number of cases in progress.
 
     This suits controllers that take seconds for a case: the sampler proposes more cases while
     others run. About three times the number of workers is a good value.
@@ -260,8 +260,8 @@ class Levels:
     level: AnyLevels = "all"
     """POV levels, separated by commas: 0, 1, 2, or own (the driver of --pov).
 
-    Level 0 ignores the VUT. Level 1 assumes that the VUT accelerates, and makes room. Level 2
-    assumes that the VUT reacts.
+    Level 0 ignores the VUT. Level 1 makes room, because it assumes that the VUT only
+    accelerates. Level 2 assumes that the VUT reacts.
     """
 
 
@@ -270,7 +270,7 @@ class EngineChoice:
     """The engine that moves the vehicles."""
 
     engine: str | None = None
-    """kinematic (equations of motion) or sumo. [default: first possible]
+    """Engine: sumo, or kinematic (faster). [default: kinematic, if possible]
 
     The engine kinematic solves the equations of motion without SUMO, and repeats at least one case
     in a hundred in SUMO. It needs a VUT and a POV of this package. The engine sumo runs all cases
@@ -283,7 +283,7 @@ class Beginning:
     """The part of a case that is shown."""
 
     from_s: float | None = None
-    """Time to begin, from the first contact or near miss, such as -3.
+    """Show from this time on: -3 is 3 s before the contact or near miss.
 
     Without a contact, the near miss is the lowest time to collision or the merge. Without a merge
     it is the end of the case.
@@ -301,8 +301,8 @@ class CampaignOptions(Execution, Junit, Test, Search, Levels):
     it. The results are in a new run folder, and `replay` shows its cases in SUMO. Ctrl-C ends the
     campaign after the running batch and prints how to continue. A second Ctrl-C stops at once.
 
-    Exit code: 0 if finished, 1 if an event occurred that --gate names, or if the VUT merged in no
-    case, 2 for wrong usage, 130 or 143 if stopped.
+    Exit code: 0 if finished, 1 if the event of a --gate occurred or the VUT never merged, 2 for
+    wrong usage, 130 or 143 if stopped.
 
     Example:  merge-sumo campaign --vut design1 --level 0 --cases 400 --seed 1
 
@@ -316,7 +316,7 @@ class CampaignOptions(Execution, Junit, Test, Search, Levels):
     It can be of any kind except traci and traci:PORT, clients that connect by themselves.
     """
     gates: Iterable[str] = ()
-    """Exit with 1 after failures, errors, timeouts, regressions, or "fmc>X".
+    """Exit 1 if this occurs: failures, errors, timeouts, regressions, fmc>X.
 
     The option may be given several times. "fmc>X" is met if the FMC at some level is above X. The
     gate regressions needs --against.
@@ -453,7 +453,7 @@ class Probability(EngineChoice, StudyOptions):
     The file contains the density and the speeds of the traffic.
     """
     distribution: AnyPath | None = None
-    """How often each case occurs, as JSON. [default: uniform]"""
+    """JSON file with the probability of each start. [default: uniform]"""
     confidence: float = 0.95
     """Probability that the interval contains the true value."""
     seed: int = 0
@@ -471,8 +471,8 @@ class Explain(StudyOptions):
 
     merge-sumo changes one value at a time: a coordinate of the start, the level of the POV, or a
     parameter of the controller. It tries other values, and confirms each printed value with a
-    second run. If the VUT is built in, a campaign explains its worst failure by itself, without
-    changing parameters. `report` shows all explanations.
+    second run. A campaign with a built-in VUT does this for its worst failure, but does not change
+    parameters. The report shows all explanations.
 
     Example:  merge-sumo explain runs/design1
     """
@@ -518,8 +518,8 @@ class Export:
 class ReplayCase(Beginning):
     """Replay a recorded case in SUMO and compare each position and speed with the record.
 
-    A case of a campaign is exported first. The command prints the motion, then "identical" or
-    "diverged at t = ...".
+    The command prints the timeline of the case, then "identical" or "diverged at t = ...". It first
+    exports a case that is in a campaign.
 
     Exit code: 0 if identical, 1 if diverged, 2 for wrong usage.
 
@@ -527,7 +527,7 @@ class ReplayCase(Beginning):
     """
 
     folder: AnyRun
-    """A scenario folder, or a campaign or its folder."""
+    """Folder of an exported case, or run folder of a campaign."""
     index: int | None = None
     """Index of the case in outcomes.jsonl, for a campaign."""
 
@@ -556,11 +556,11 @@ class Rerun(Page, Levels, StudyOptions):
     The cases are those that the campaign recorded. To search for cases that only the new version
     fails, use `campaign --against`.
 
-    RUN can also be a cases file, which `export --format cases` writes. Then --out writes a new
-    cases file with the new results.
+    RUN can also be a cases file, which `export --format cases` writes. For a cases file, --out
+    writes a new cases file instead of a page.
 
-    If your own controller changes the result of a case, the case runs once more. If that result
-    differs again, the case is "not repeatable" and does not count.
+    If your own controller gives another result than recorded, the case runs once more. If the two
+    new results differ, the case is "not repeatable" and does not count.
 
     Exit code: 0 if no case broke, 1 if a case broke, 2 for wrong usage. A case broke if it passed
     before and does not pass now. With a cases file the exit code is also 1 for a new error or

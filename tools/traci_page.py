@@ -68,7 +68,7 @@ last step.
 
 - `--vut "traci:COMMAND {port}"` starts the program, starts it again if it ends, and stops it \
 at the end. The port replaces `{port}`, and is in the environment variable \
-`MERGE_SUMO_PORT`. A program that calls `traci.start(...)` passes this port on (`port=...`).
+`MERGE_SUMO_PORT`. If a program calls `traci.start(...)`, add this port as the argument `port=`.
 - `--vut traci` waits for a program that you start, on 127.0.0.1:8813. `--vut traci:9000` waits on \
 another port.
 - The program can run for one episode, for several or for all. It can keep one connection or open \

@@ -34,7 +34,7 @@ from merge_sumo.scenario.scenario import level_name
 LABEL_CHARACTERS = 13
 COLUMNS = (
     "POV level",
-    "all starts that fail   ",  # as wide as the widest usual cell
+    "starts that fail       ",  # as wide as the widest usual cell
     "failures found",
     "undecided",
     "no verdict",

@@ -30,7 +30,7 @@ kind of the worst case: late brake, contact at 12.2 m/s"""
 PRINTED = """\
 design2 on us23: 480 cases, 180 failures (front bumpers within 6 m when the VUT reaches the merge point)
 
-POV level   all starts that fail      failures found   regions    FMC
+POV level   starts that fail          failures found   regions    FMC
 0           < 0.15 %                               0
 1           1.1 %  (0.69 to 1.7)                  44         2   .102
 2           0.2 %  (0.06 to 0.51)                136         7   .018
