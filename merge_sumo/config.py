@@ -79,7 +79,7 @@ class Policies:
     """Drivers."""
 
     policies: AnyPath | None = None
-    """Learned POV drivers: a folder, or a shipped set: human or roundabout.
+    """Learned POV drivers: a folder, or the shipped human or roundabout.
 
     `merge-sumo train --out FOLDER` writes such a folder. By default it is the shipped library for
     the scenario, or else the one for us23.
@@ -301,8 +301,8 @@ class CampaignOptions(Execution, Junit, Test, Search, Levels):
     it. The results are in a new run folder, and `replay` shows its cases in SUMO. Ctrl-C ends the
     campaign after the running batch and prints how to continue. A second Ctrl-C stops at once.
 
-    Exit code: 0 if finished, 1 if the event of a --gate occurred or the VUT never merged, 2 for
-    wrong usage, 130 or 143 if stopped.
+    Exit code: 0 if finished, 1 if the VUT never merged or if failures (or other events) occurred
+    that --gate names, 2 for wrong usage, 130 or 143 if stopped.
 
     Example:  merge-sumo campaign --vut design1 --level 0 --cases 400 --seed 1
 
@@ -403,7 +403,7 @@ class CaseOptions(Beginning, Test):
     gui: bool = False
     """Open the replay in sumo-gui when the case has ended."""
     out: AnyPath | None = None
-    """New folder for the case, which `replay` and sumo-gui can show."""
+    """New folder for the case. Open it with `merge-sumo replay` or in sumo-gui."""
     recorded: tuple[AnyRun, int] | None = None
     """A recorded case: the folder of the campaign and the index of the case. Other options override
     its values."""
@@ -556,8 +556,8 @@ class Rerun(Page, Levels, StudyOptions):
     The cases are those that the campaign recorded. To search for cases that only the new version
     fails, use `campaign --against`.
 
-    RUN can also be a cases file, which `export --format cases` writes. For a cases file, --out
-    writes a new cases file instead of a page.
+    RUN can also be a cases file, which `export --format cases` writes. Then --out writes a new
+    cases file instead of an HTML page.
 
     If your own controller gives another result than recorded, the case runs once more. If the two
     new results differ, the case is "not repeatable" and does not count.
