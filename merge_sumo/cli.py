@@ -208,7 +208,7 @@ def campaign(
         str,
         Parameter(
             help="Vehicle under test: a built-in one, such as design2, or your own controller. "
-            "`merge-sumo vuts` lists all.",
+            "For all kinds, run: merge-sumo vuts.",
         ),
     ] = "",
     config: Options[c.CampaignOptions] = c.CampaignOptions(),
@@ -358,7 +358,7 @@ def rerun(
     stress: Annotated[
         bool,
         Parameter(
-            help="""Run each case with small changes of the simulation. Which failures remain?
+            help="""Run each case with small changes, and show which failures remain.
 
             A failure is robust if it fails with each change: a shorter step, an actuator with a
             lag, limited power, a start with the error of a sensor, and longer cars.""",

@@ -170,8 +170,8 @@ class Test(Drivers, ScenarioChanges, FailureRule):
     """The scenario and the rules of a test."""
 
     scenario: AnyScenario | None = None
-    """Scenario: a name that `merge-sumo scenario list` prints, or your own TOML file. [default:
-    us23]
+    """Name of a scenario, or your own TOML file. For all names, run: merge-sumo scenario list.
+    [default: us23]
 
     `merge-sumo scenario new` writes such a file.
     """
@@ -258,7 +258,7 @@ class Levels:
     """Levels of the POV."""
 
     level: AnyLevels = "all"
-    """POV levels, separated by commas: 0, 1, 2, or own (the driver of --pov).
+    """POV levels, separated by commas: 0, 1, 2, or own (your own driver, given with --pov).
 
     Level 0 ignores the VUT. Level 1 makes room, because it assumes that the VUT only
     accelerates. Level 2 assumes that the VUT reacts.
@@ -298,11 +298,11 @@ class CampaignOptions(Execution, Junit, Test, Search, Levels):
     """Test a controller: run cases in SUMO, find failures, and write a report.
 
     The controller drives the vehicle under test (VUT). The primary other vehicle (POV) reacts to
-    it. The results are in a new run folder, and `replay` shows its cases in SUMO. Ctrl-C ends the
-    campaign after the running batch and prints how to continue. A second Ctrl-C stops at once.
+    it. The results are in a new run folder. Ctrl-C ends the campaign after the running batch and
+    prints how to continue. A second Ctrl-C stops at once.
 
-    Exit code: 0 if finished, 1 if the VUT never merged or if failures (or other events) occurred
-    that --gate names, 2 for wrong usage, 130 or 143 if stopped.
+    Exit code: 0 if finished; 1 if the VUT never merged, or if something occurred that you named
+    with --gate (such as failures); 2 for wrong usage; 130 or 143 if stopped.
 
     Example:  merge-sumo campaign --vut design1 --level 0 --cases 400 --seed 1
 
@@ -447,8 +447,8 @@ class Probability(EngineChoice, StudyOptions):
     cases: int | None = None
     """Number of new cases. [default: 100000; with --engine sumo: 4000]"""
     traffic: AnyPath | None = None
-    """Also estimate failures per merge in traffic: exid-2, exid-3 or exid-5 (sites of the exiD
-    data set), or your own TOML file.
+    """Also estimate how many merges fail in this traffic: exid-2, exid-3 or exid-5 (sites of the
+    exiD data set), or your own TOML file.
 
     The file contains the density and the speeds of the traffic.
     """
@@ -472,7 +472,7 @@ class Explain(StudyOptions):
     merge-sumo changes one value at a time: a coordinate of the start, the level of the POV, or a
     parameter of the controller. It tries other values, and confirms each printed value with a
     second run. A campaign with a built-in VUT does this for its worst failure, but does not change
-    parameters. The report shows all explanations.
+    parameters. The report then shows the explanation.
 
     Example:  merge-sumo explain runs/design1
     """
@@ -556,8 +556,8 @@ class Rerun(Page, Levels, StudyOptions):
     The cases are those that the campaign recorded. To search for cases that only the new version
     fails, use `campaign --against`.
 
-    RUN can also be a cases file, which `export --format cases` writes. Then --out writes a new
-    cases file instead of an HTML page.
+    RUN can also be a cases file, written by `merge-sumo export --format cases`. Then --out writes
+    a new cases file instead of an HTML page.
 
     If your own controller gives another result than recorded, the case runs once more. If the two
     new results differ, the case is "not repeatable" and does not count.
@@ -729,7 +729,7 @@ class GroundTruth(EngineChoice, Execution, Test):
     In Python also a class, a function or an object.
     """
     level: AnyLevels = "all"
-    """POV levels, separated by commas: 0, 1, 2, or own (the driver of --pov)."""
+    """POV levels, separated by commas: 0, 1, 2, or own (your own driver, given with --pov)."""
     _: KW_ONLY
     cases: int | None = None
     """Uniform cases per level. [default: 10000, or 20000 at level 2]"""
@@ -755,7 +755,7 @@ class Benchmark(Execution, Test):
     In Python also a class, a function or an object.
     """
     level: AnyLevels = "all"
-    """POV levels, separated by commas: 0, 1, 2, or own (the driver of --pov)."""
+    """POV levels, separated by commas: 0, 1, 2, or own (your own driver, given with --pov)."""
     _: KW_ONLY
     samplers: Names | None = None
     """Names of samplers, separated by commas. [default: all]"""

@@ -139,7 +139,7 @@ def _avoidable(of: Mapping[str, Fact]) -> str:
     parts = []
     for number in sorted(drivers, key=float, reverse=True):
         parts.append(f"{_times(number, driven)} by {', '.join(drivers[number])}")
-    parts.append(f"{_times(of[AVOIDED_BY_POV].value, driven)} by a careful POV")
+    parts.append(f"{_times(of[AVOIDED_BY_POV].value, driven)} if the POV brakes carefully")
     text = "; ".join(parts)
     return f"of the {driven.shown} worst: {text}" if DRIVEN in of else text
 

@@ -36,7 +36,7 @@ POV level   starts that fail          failures found   regions    FMC
 2           0.2 %  (0.06 to 0.51)                136         7   .018
 
 Not counted: 25 cases with contact (`fail_when` unsafe counts them)
-Avoidable:   all 180 by careful, fsm, reg157, rss; 169 by a careful POV
+Avoidable:   all 180 by careful, fsm, reg157, rss; 169 if the POV brakes carefully
 Worst:       case 157, late brake, contact at 12.2 m/s
              merge-sumo replay runs/latest 157 --gui"""  # noqa: E501 (as it is printed)
 SHARES = ("< 0.15 %", "1.1 %  (0.69 to 1.7)", "0.2 %  (0.06 to 0.51)")
@@ -61,7 +61,7 @@ def printed(text: str) -> str:
 def test_says_each_number_once_in_columns():
     assert printed(FACTS) == PRINTED
     some = FACTS.replace("fsm avoids: 180", "fsm avoids: 0")
-    assert "all 180 by careful, reg157, rss; none by fsm; 169 by a careful POV" in printed(some)
+    assert "180 by careful, reg157, rss; none by fsm; 169 if the POV brakes" in printed(some)
     some += "\nfailures that ran again with reference drivers: 500"
     assert "Avoidable:   of the 500 worst: 180 by careful, reg157" in printed(some)
 
