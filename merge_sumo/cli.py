@@ -253,7 +253,7 @@ def run(
     vut: Annotated[
         str | None,
         Parameter(
-            help="Vehicle under test, as in `campaign`. With --case, needed only for your own code."
+            help="VUT, as for merge-sumo campaign. With --case, you can omit a built-in VUT."
         ),
     ] = None,
     config: Options[c.CaseOptions] = c.CaseOptions(),
@@ -358,7 +358,8 @@ def rerun(
     stress: Annotated[
         bool,
         Parameter(
-            help="""Run each case with small changes, and show which failures remain.
+            help="""Run each case with small changes of the simulation, and show which failures
+            remain.
 
             A failure is robust if it fails with each change: a shorter step, an actuator with a
             lag, limited power, a start with the error of a sensor, and longer cars.""",

@@ -79,7 +79,7 @@ class Policies:
     """Drivers."""
 
     policies: AnyPath | None = None
-    """Learned POV drivers: a folder, or the shipped human or roundabout.
+    """Learned POV drivers: a folder, or 'human' or 'roundabout' (shipped).
 
     `merge-sumo train --out FOLDER` writes such a folder. By default it is the shipped library for
     the scenario, or else the one for us23.
@@ -301,17 +301,17 @@ class CampaignOptions(Execution, Junit, Test, Search, Levels):
     it. The results are in a new run folder. Ctrl-C ends the campaign after the running batch and
     prints how to continue. A second Ctrl-C stops at once.
 
-    Exit code: 0 if finished; 1 if the VUT never merged, or if something occurred that you named
-    with --gate (such as failures); 2 for wrong usage; 130 or 143 if stopped.
+    Exit code: 1 if the VUT never merged, or if a --gate applies (with --gate failures: if a case
+    failed); 2 for wrong usage; 130 or 143 if stopped; else 0.
 
     Example:  merge-sumo campaign --vut design1 --level 0 --cases 400 --seed 1
 
-    Example:  merge-sumo campaign --vut design1 --against design2 --level 0 --cases 40
+    Example:  merge-sumo campaign --vut "design2?x1_m=120" --against design2 --level 1 --cases 40
     """
 
     against: AnyVut | None = None
-    """Earlier version of the VUT. Both drive each case, and the sampler searches for cases that
-    only the new version fails.
+    """Earlier version of the VUT. Each case runs with both versions, and the sampler searches for
+    cases that only the new version fails.
 
     It can be of any kind except traci and traci:PORT, clients that connect by themselves.
     """
@@ -395,9 +395,9 @@ class CaseOptions(Beginning, Test):
     svo_rad: float | None = None
     """Social value orientation of the POV at level 2: 0 is egoistic, pi/2 altruistic."""
     headway_ahead_s: float | None = None
-    """Time headway from the POV to the car ahead, in traffic."""
+    """With traffic in the scenario: headway from the POV to the car ahead."""
     headway_behind_s: float | None = None
-    """Time headway from the car behind to the POV, in traffic."""
+    """With traffic in the scenario: headway from the car behind to the POV."""
     debug: bool = False
     """Run the VUT in this process without a deadline, for breakpoints."""
     gui: bool = False
@@ -433,8 +433,9 @@ class Probability(EngineChoice, StudyOptions):
     """Estimate the failure probability of a VUT, with a valid confidence interval.
 
     The cases of the campaign were chosen to fail, so their share of failures is not a probability.
-    They show where failures are likely. merge-sumo draws new cases there and, separately, in the
-    rest of the pool of starts. The interval is valid even if the campaign has missed failures.
+    They show from which starts failures are likely. merge-sumo draws some new cases from these
+    starts, and others from all remaining starts. The interval is valid even if the campaign has
+    missed failures.
 
     Example:  merge-sumo probability runs/design2
 
@@ -496,9 +497,9 @@ class Export:
     run: AnyRun
     """Run folder of the campaign."""
     indices: Indices | None = None
-    """Indices of the cases. [default: all for csv, up to 40 for cases]
+    """Indices of the cases. [default: with --format csv all; with --format cases at most 40]
 
-    For sumo and openscenario name at least one. Without indices, cases writes those that show
+    With --format sumo and openscenario, name at least one. Without indices, cases writes those that show
     changes of a VUT best.
     """
     _: KW_ONLY
@@ -518,8 +519,8 @@ class Export:
 class ReplayCase(Beginning):
     """Replay a recorded case in SUMO and compare each position and speed with the record.
 
-    The command prints the timeline of the case, then "identical" or "diverged at t = ...". It first
-    exports a case that is in a campaign.
+    The command prints the timeline of the case, then "identical" or "diverged at t = ...". If FOLDER
+    is a run folder, it first exports the case.
 
     Exit code: 0 if identical, 1 if diverged, 2 for wrong usage.
 
@@ -559,8 +560,8 @@ class Rerun(Page, Levels, StudyOptions):
     RUN can also be a cases file, written by `merge-sumo export --format cases`. Then --out writes
     a new cases file instead of an HTML page.
 
-    If your own controller gives another result than recorded, the case runs once more. If the two
-    new results differ, the case is "not repeatable" and does not count.
+    If a case of your own controller has a new result, the case runs a second time. If these two
+    runs differ, the case is "not repeatable" and does not count.
 
     Exit code: 0 if no case broke, 1 if a case broke, 2 for wrong usage. A case broke if it passed
     before and does not pass now. With a cases file the exit code is also 1 for a new error or
@@ -594,14 +595,14 @@ class Stress(StudyOptions):
 class Compare(Page):
     """Compare recorded versions of a VUT: broken and fixed cases.
 
-    The command runs no cases. It pairs the cases that two campaigns share. If each campaign has its
-    own cases, it compares the shares of cases that pass.
+    The command runs no cases. It pairs the cases that occur in two campaigns. If campaigns have no case
+    in common, it compares which percentage of their cases passes.
 
     Exit code: 0 if nothing got worse, 2 for wrong usage, 1 if one of these is true:
 
     - a case broke
     - a version passes a smaller share of its own cases than the one before (Fisher's exact test)
-    - the last version was tested in no case
+    - no case was judged with the last version
 
     Example:  merge-sumo compare runs/design1 runs/design2 --out changes.html
     """
@@ -615,7 +616,7 @@ class Compare(Page):
 
 @dataclass(frozen=True, kw_only=True)
 class Vuts(Policies):
-    """List the vehicles under test: the built-in ones, and the kinds that you can bring.
+    """List the built-in vehicles under test, and the kinds of controllers that --vut accepts.
 
     Example:  merge-sumo vuts
     """
