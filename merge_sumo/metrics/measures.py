@@ -158,11 +158,11 @@ def measure(
 class Measures:
     """The measures of one episode (one simulated case), by name.
 
-    `dx_m`, `dv_mps`, `ttc_s`, `drac_mps2` and `merged_first` belong to the time t1. This is the
-    first step with x_VUT >= 0, or the step of the merge on a road with an acceleration lane. They
-    are None if the VUT never arrived. In traffic the POV of a definition is the car of the mainline
-    that is nearest to the VUT at t1. Severity, clearance, bumper gap, braking after M and impact
-    speed take all cars into account.
+    `dx_m`, `dv_mps`, `ttc_s`, `drac_mps2` and `merged_first` describe the state at the time t1.
+    This is the first step with x_VUT >= 0, or the step of the merge on a road with an acceleration
+    lane. These measures are None if the VUT never arrived. In traffic the POV of a definition is
+    the car of the mainline that is nearest to the VUT at t1. Severity, clearance, bumper gap,
+    braking after M and impact speed take all cars into account.
 
     A measure is computed when it is first read, or by `compute_all`. Measures that were read from
     a record have no trajectory.
@@ -317,9 +317,9 @@ class Measures:
 
     @measure(worse="low", label="smallest gap from M on, or overlap (negative)", column="clearance")
     def clearance_m(self) -> float | None:
-        """Smallest gap between bumpers from M on, or the overlap of bodies if that is less.
+        """Smallest gap between bumpers from M on, or minus the depth of an overlap of bodies.
 
-        An overlap before M counts too. 0 or less with a contact. None if the VUT neither touched a
+        0 or less with a contact, also with a contact before M. None if the VUT neither touched a
         car nor merged.
         """
         found = self.bumper_gap_m, self.after_gap_m, self.encounter.overlap_m

@@ -318,8 +318,8 @@ def probability_lines(found: ProbabilityResult) -> list[str]:
         for one in found.overall.strata:
             expected = "failures" if one.expects_failures else "no failure"
             lines.append(
-                f"  where the campaign expects {expected}, {one.share:.2%} of the cases: "
-                f"{one.failures:,} of {one.cases:,} fail, {one.low:.3g} to {one.high:.3g}"
+                f"  {expected} expected ({one.share:.2%} of random cases): {one.failures:,} of "
+                f"{one.cases:,} drawn here fail, P(fail) {one.low:.3g} to {one.high:.3g}"
             )
     if found.overall is None or len(found.levels) > 1:
         for level, estimate in found.levels.items():
@@ -343,10 +343,10 @@ def _per_merge(one: PerMerge, at: str) -> list[str]:
     most = "" if one.most == one.least else f" to {one.most:.3g}"
     return [
         f"failures per merge: {one.least:.3g}{most} [{one.low:.3g}, {one.high:.3g}], "
-        f"{at}, for all shares of the POV levels",
+        f"{at}, for any mix of the POV levels",
         f"  traffic {traffic.name}: {traffic.density_veh_per_km:g} veh/km ({traffic.source})",
-        f"  counted: {one.cars:.2g} cars per merge that start in the pool, "
-        f"{one.counted_speeds:.0%} of the speeds of this traffic",
+        f"  counted: only cars that start in the pool, {one.cars:.2g} per merge; "
+        f"{one.counted_speeds:.0%} of this traffic has such speeds",
     ]
 
 

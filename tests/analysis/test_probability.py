@@ -227,7 +227,7 @@ class TestOfACampaign:
         code, said, err = command_line("probability", campaign.folder, *options)
         assert code == 0, err
         assert re.match(r"failures per merge: [0-9.e-]+ \[", said), "one level: one estimate"
-        assert "counted: 0.72 cars per merge" in said
+        assert "start in the pool, 0.72 per merge" in said
         written = json.loads(out.read_text())
         assert written["overall"] is None
         one, level = written["per_merge"], written["levels"]["0"]
