@@ -499,8 +499,8 @@ class Export:
     indices: Indices | None = None
     """Indices of the cases. [default: with --format csv all; with --format cases at most 40]
 
-    With --format sumo and openscenario, name at least one. Without indices, cases writes those that show
-    changes of a VUT best.
+    With --format sumo and openscenario, name at least one. Without indices, cases writes those that
+    show changes of a VUT best.
     """
     _: KW_ONLY
     file_format: str = "sumo"
@@ -519,8 +519,8 @@ class Export:
 class ReplayCase(Beginning):
     """Replay a recorded case in SUMO and compare each position and speed with the record.
 
-    The command prints the timeline of the case, then "identical" or "diverged at t = ...". If FOLDER
-    is a run folder, it first exports the case.
+    The command prints the timeline of the case, then "identical" or "diverged at t = ...". If
+    FOLDER is a run folder, it first exports the case.
 
     Exit code: 0 if identical, 1 if diverged, 2 for wrong usage.
 
@@ -595,8 +595,8 @@ class Stress(StudyOptions):
 class Compare(Page):
     """Compare recorded versions of a VUT: broken and fixed cases.
 
-    The command runs no cases. It pairs the cases that occur in two campaigns. If campaigns have no case
-    in common, it compares which percentage of their cases passes.
+    The command runs no cases. It pairs the cases that occur in two campaigns. If campaigns have no
+    case in common, it compares which percentage of their cases passes.
 
     Exit code: 0 if nothing got worse, 2 for wrong usage, 1 if one of these is true:
 
