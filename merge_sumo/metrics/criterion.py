@@ -53,8 +53,8 @@ CRITERIA = {
     "contact": NamedCriterion("clearance_m <= 0", "bodies overlap (a contact)"),
     "unsafe": NamedCriterion(
         "clearance_m <= 0 or brake_after_mps2 > 3",
-        "a contact, or the car behind must brake harder than 3 m/s2, which a lane change may "
-        "demand of others by UN Regulation No. 79",
+        "a contact, or the car behind must brake harder than 3 m/s2, the limit of UN "
+        "Regulation No. 79 for the car behind in a lane change",
     ),
 }
 """Named criteria, for `fail_when`."""
