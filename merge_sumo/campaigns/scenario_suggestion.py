@@ -107,8 +107,8 @@ def about(road: Road) -> list[str]:
         # Those after M, too: all drive on there.
         limits_mps = [piece.speed_limit_mps for piece in path.pieces]
         lines.append(
-            f"{name}: {' '.join(edges)}, {path.before_m:.1f} m before M; speed limits from "
-            f"{min(limits_mps):g} to {max(limits_mps):g} m/s"
+            f"{name}: {' '.join(edges)}, {path.before_m:.1f} m before M; lowest speed "
+            f"limit {min(limits_mps):g} m/s, highest {max(limits_mps):g} m/s"
         )
     m = road.lane_point(0.0, on_ramp=road.used_lane_m is None)
     merge = f"M: lane {m.lane} at ({m.x_m:.1f}, {m.y_m:.1f})"

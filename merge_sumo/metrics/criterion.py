@@ -138,7 +138,7 @@ class Criterion:
         return self.require is None and "score" in condition_of(self.condition).names
 
     def description(self, scenario: Scenario) -> str:
-        """Return what makes a case of a scenario fail, to stand behind "fails with".
+        """Return the condition under which a case of a scenario fails.
 
         Args:
             scenario: the scenario.

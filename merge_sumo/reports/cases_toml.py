@@ -41,8 +41,8 @@ MOST = 40
 """Maximum number of cases of a file where the user names none."""
 ABOUT = """\
 # `merge-sumo rerun THIS-FILE --vut SPEC` exits with 1 if a case no longer passes, ends in a new
-# error, or passes with a new contact. With `tolerance = 0.2` above the cases, it also exits with 1
-# if a margin drops by more than 0.2. To accept a known failure, add to its line: accepted = "WHY"
+# error, or passes with a new contact. With a line `tolerance = 0.2` before `cases`, it also exits
+# with 1 if a margin drops by more than 0.2. To accept a failure, add to its line: accepted = "WHY"
 """
 
 

@@ -91,13 +91,13 @@ def version_change_headline(version_change: VersionChange) -> str:
     parts, later = [], version_change.number
     if version_change.passes_less:
         by = f"by Fisher's exact test p = {version_change.p_value:.2g}"
-        parts.append(f"{later} passes less often than {later - 1}, {by}")
+        parts.append(f"version {later} passes less often than version {later - 1}, {by}")
     if version_change.cases:
         numbers = [f"{number} {group}" for group, number in version_change.groups.items()]
         parts.append(f"of {counted(len(version_change.cases), 'shared case')} {', '.join(numbers)}")
     else:
         parts.append("no case is shared")
-    return f"from {later - 1} to {later}: {'; '.join(parts)}"
+    return f"from version {later - 1} to version {later}: {'; '.join(parts)}"
 
 
 def comparison_summary(compared: Comparison) -> list[str]:
@@ -489,8 +489,8 @@ def timelines(run: RecordedCampaign, outcomes: Sequence[Outcome]) -> dict[int, T
 
 def _avoidance(one: Avoidance) -> list[Event]:
     """Return the drivers that avoid a failure from its start, and the last time to take over."""
-    by = either(one.avoided_by) if one.avoided_by else "no reference driver"
-    text = f"in the VUT's place, {by} avoids this from the start"
+    by = ", ".join(one.avoided_by) or "none"
+    text = f"reference drivers that avoid this failure from the start: {by}"
     events = [Event(0.0, f"{text}; a careful POV avoids it" if one.pov_careful else text)]
     if one.latest_takeover_s is not None:
         text = f"last time at which the reference driver {TAKES_OVER} could still take over"

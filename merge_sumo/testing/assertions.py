@@ -32,7 +32,9 @@ def _message(run: CampaignRun, seed: int) -> str | None:
     if run.summary.tested and not wrong:
         return None
     lines = [f"{run.recorded.vut}: {run.summary.counts}, with seed {seed}"]
-    lines.append(f"  a case fails with {run.recorded.criterion.description(run.recorded.scenario)}")
+    lines.append(
+        f"  failure criterion: {run.recorded.criterion.description(run.recorded.scenario)}"
+    )
     lines += run.summary.error_lines()
     if not run.summary.tested:
         lines.append(f"  {run.summary.nothing_tested}")

@@ -100,7 +100,7 @@ def test_shared_cases_are_paired_wherever_they_stand(tmp_path):
         "   level 0: FMC 0.0079",
         f"2  b, {b.folder}  1 failure (0 contacts) in 3 cases",
         "   level 0: FMC 0.0079",
-        "from 1 to 2: of 3 shared cases 1 worse, 1 better, 1 same verdict",
+        "from version 1 to version 2: of 3 shared cases 1 worse, 1 better, 1 same verdict",
         "  worse            1  safe -> safe (broke)",
         "  better           1  safe -> safe (fixed)",
         "  same verdict     1  safe -> safe (pass with both)",
@@ -115,7 +115,8 @@ def test_a_version_that_passes_less_often_than_chance_explains_is_worse(call, tm
     files = "--out", tmp_path / "page.html", "--junit", tmp_path / "junit.xml"
     said = call("compare", a.folder, b.folder, *files)
     assert (
-        "\nfrom 1 to 2: 2 passes less often than 1, by Fisher's exact test p = 0.0024; "
+        "\nfrom version 1 to version 2: version 2 passes less often than version 1, "
+        "by Fisher's exact test p = 0.0024; "
         "of 8 shared cases 0 worse, 0 better, 8 same verdict\n"
     ) in said.out
     assert said.code == 1
@@ -136,8 +137,8 @@ def test_three_versions_are_two_changes(tmp_path):
         0,
     ]
     assert [line for line in found.lines() if line.startswith("from ")] == [
-        "from 1 to 2: of 1 shared case 1 worse, 0 better",
-        "from 2 to 3: of 1 shared case 0 worse, 1 better",
+        "from version 1 to version 2: of 1 shared case 1 worse, 0 better",
+        "from version 2 to version 3: of 1 shared case 0 worse, 1 better",
     ]
 
 

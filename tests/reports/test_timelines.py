@@ -191,7 +191,7 @@ def check_moment(text: str, row: int, m: Motion) -> None:
     elif text.startswith("the VUT did not reach "):
         assert not m.arrived
     else:
-        assert re.match("in the VUT's place, |last time at which |fails: margin ", text), text
+        assert re.match("reference drivers that |last time at which |fails: margin ", text), text
 
 
 def needed_mps2(m: Motion) -> float:

@@ -175,7 +175,7 @@ def test_a_road_has_its_right_of_way_and_its_limits_after_m(tmp_path, name, orde
     lines = api.new_scenario(tmp_path / "a.toml", net=net, mainline=mainline, ramp=ramp).lines()
     assert f"right of way: {first}" in lines
     for line in lines[1:3]:
-        assert "speed limits from 1.39 to " in line
+        assert "lowest speed limit 1.39 m/s, highest " in line
 
 
 class TestRoadOf:
