@@ -253,7 +253,7 @@ def run(
     vut: Annotated[
         str | None,
         Parameter(
-            help="VUT, as for merge-sumo campaign. With --case, you can omit a built-in VUT."
+            help="VUT, as for merge-sumo campaign. With --case, only needed for your own code."
         ),
     ] = None,
     config: Options[c.CaseOptions] = c.CaseOptions(),

@@ -79,7 +79,7 @@ class Policies:
     """Drivers."""
 
     policies: AnyPath | None = None
-    """Learned POV drivers: a folder, or 'human' or 'roundabout' (shipped).
+    """Learned POV drivers: a folder, or the name 'human' or 'roundabout'.
 
     `merge-sumo train --out FOLDER` writes such a folder. By default it is the shipped library for
     the scenario, or else the one for us23.
@@ -188,7 +188,7 @@ class Search:
     batch: int | None = None
     """Cases per batch. [default: chosen by the sampler]"""
     in_flight: int | None = None
-    """Do not wait for batches: keep this number of cases in progress.
+    """Instead of batches: keep this number of cases running all the time.
 
     This suits controllers that take seconds for a case: the sampler proposes more cases while
     others run. About three times the number of workers is a good value.
@@ -301,8 +301,8 @@ class CampaignOptions(Execution, Junit, Test, Search, Levels):
     it. The results are in a new run folder. Ctrl-C ends the campaign after the running batch and
     prints how to continue. A second Ctrl-C stops at once.
 
-    Exit code: 1 if the VUT never merged, or if a --gate applies (with --gate failures: if a case
-    failed); 2 for wrong usage; 130 or 143 if stopped; else 0.
+    Exit code: 1 if the VUT never merged, or if something occurred that --gate names, such as a
+    failure; 2 for wrong usage; 130 or 143 if stopped; else 0.
 
     Example:  merge-sumo campaign --vut design1 --level 0 --cases 400 --seed 1
 
@@ -433,7 +433,7 @@ class Probability(EngineChoice, StudyOptions):
     """Estimate the failure probability of a VUT, with a valid confidence interval.
 
     The cases of the campaign were chosen to fail, so their share of failures is not a probability.
-    They show from which starts failures are likely. merge-sumo draws some new cases from these
+    But these cases show which starts are likely to fail. merge-sumo draws some new cases from these
     starts, and others from all remaining starts. The interval is valid even if the campaign has
     missed failures.
 
@@ -497,7 +497,7 @@ class Export:
     run: AnyRun
     """Run folder of the campaign."""
     indices: Indices | None = None
-    """Indices of the cases. [default: with --format csv all; with --format cases at most 40]
+    """Indices of the cases. [default for csv: all; for a cases file: at most 40]
 
     With --format sumo and openscenario, name at least one. Without indices, cases writes those that
     show changes of a VUT best.
@@ -520,7 +520,7 @@ class ReplayCase(Beginning):
     """Replay a recorded case in SUMO and compare each position and speed with the record.
 
     The command prints the timeline of the case, then "identical" or "diverged at t = ...". If
-    FOLDER is a run folder, it first exports the case.
+    FOLDER is the run folder of a campaign, the command first exports the case.
 
     Exit code: 0 if identical, 1 if diverged, 2 for wrong usage.
 
@@ -530,15 +530,15 @@ class ReplayCase(Beginning):
     folder: AnyRun
     """Folder of an exported case, or run folder of a campaign."""
     index: int | None = None
-    """Index of the case in outcomes.jsonl, for a campaign."""
+    """Index of the case, if FOLDER is the run folder of a campaign."""
 
 
 @dataclass(frozen=True)
 class Report:
     """Write the report of a campaign again and print its path.
 
-    With --json the command prints each fact of the report, with the file and the key that it comes
-    from.
+    With --json the command prints each value of the report, with the result file and the key where
+    the value is recorded.
 
     Example:  merge-sumo report runs/design2
     """
@@ -560,8 +560,8 @@ class Rerun(Page, Levels, StudyOptions):
     RUN can also be a cases file, written by `merge-sumo export --format cases`. Then --out writes
     a new cases file instead of an HTML page.
 
-    If a case of your own controller has a new result, the case runs a second time. If these two
-    runs differ, the case is "not repeatable" and does not count.
+    If your own controller does not repeat the recorded result of a case, the case runs once more.
+    If these two new runs differ from each other, the case is "not repeatable" and does not count.
 
     Exit code: 0 if no case broke, 1 if a case broke, 2 for wrong usage. A case broke if it passed
     before and does not pass now. With a cases file the exit code is also 1 for a new error or
@@ -601,14 +601,15 @@ class Compare(Page):
     Exit code: 0 if nothing got worse, 2 for wrong usage, 1 if one of these is true:
 
     - a case broke
-    - a version passes a smaller share of its own cases than the one before (Fisher's exact test)
+    - a version passes a significantly smaller share of its cases than the version before it
+      (Fisher's exact test)
     - no case was judged with the last version
 
     Example:  merge-sumo compare runs/design1 runs/design2 --out changes.html
     """
 
     runs: Iterable[AnyRun]
-    """The campaigns, or their folders, the oldest first."""
+    """Run folders of the campaigns, the oldest first."""
 
 
 # Bring your own
@@ -714,12 +715,12 @@ class Train:
 
 @dataclass(frozen=True)
 class GroundTruth(EngineChoice, Execution, Test):
-    """Find the ground truth of a VUT: run uniform cases at each level.
+    """Find the ground truth of a VUT: run random cases at each level, without a search.
 
     merge-sumo keeps the result in a cache (MERGE_SUMO_CACHE, or the cache folder of the user) and
     reads it again if no input has changed. The inputs include all files that the VUT has loaded.
-    The result for an object of a Python process is not kept. If the kinematic engine ran the cases,
-    the output shows how many of them SUMO repeated.
+    The result for a VUT that is a Python object is not kept. If the kinematic engine ran the cases
+    (--engine), merge-sumo runs some of them in SUMO as a check, and the output shows how many.
 
     Example:  merge-sumo truth --vut design2 --level 1 --cases 10000
     """
@@ -733,7 +734,7 @@ class GroundTruth(EngineChoice, Execution, Test):
     """POV levels, separated by commas: 0, 1, 2, or own (your own driver, given with --pov)."""
     _: KW_ONLY
     cases: int | None = None
-    """Uniform cases per level. [default: 10000, or 20000 at level 2]"""
+    """Random cases per level. [default: 10000, or 20000 at level 2]"""
     seed: int = 0
     """Random seed. The same seed gives the same cases."""
 

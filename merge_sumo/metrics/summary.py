@@ -272,7 +272,7 @@ class Summary:
     Example:
         >>> summary = summarise(run.outcomes, run.levels)
         >>> summary.counts, summary.levels[1].fmc
-        ('12 failures (3 contacts) in 60 cases', 0.0213)
+        ('12 failures (3 with contact) in 60 cases', 0.0213)
     """
 
     cases: int
@@ -309,7 +309,7 @@ class Summary:
             parts.append(counted(self.errors, "error"))
         if self.timeouts:
             parts.append(counted(self.timeouts, "timeout"))
-        contacts = f" ({counted(self.contacts, 'contact')})" if self.failures else ""
+        contacts = f" ({self.contacts} with contact)" if self.failures else ""
         parts.append(counted(self.failures, "failure") + contacts)
         if self.undecided:
             parts.append(f"{self.undecided} undecided")

@@ -96,9 +96,9 @@ def test_shared_cases_are_paired_wherever_they_stand(tmp_path):
     ]
     assert (found.broke, found.worse) == (1, True)
     assert found.lines()[:8] == [
-        f"1  a, {a.folder}  1 failure (0 contacts) in 3 cases",
+        f"1  a, {a.folder}  1 failure (0 with contact) in 3 cases",
         "   level 0: FMC 0.0079",
-        f"2  b, {b.folder}  1 failure (0 contacts) in 3 cases",
+        f"2  b, {b.folder}  1 failure (0 with contact) in 3 cases",
         "   level 0: FMC 0.0079",
         "from version 1 to version 2: of 3 shared cases 1 worse, 1 better, 1 same verdict",
         "  worse            1  safe -> safe (broke)",

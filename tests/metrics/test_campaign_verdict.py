@@ -44,7 +44,7 @@ def test_errors_and_timeouts_are_grouped_by_message_errors_first_then_the_most_f
     ]
     assert (found.cases, found.errors, found.timeouts, found.tested) == (10, 3, 4, 3)
     failed = counted(len(failures(run.outcomes)), "failure")
-    contacts = counted(found.contacts, "contact")
+    contacts = f"{found.contacts} with contact"
     assert found.counts == f"3 errors, 4 timeouts, {failed} ({contacts}) in 10 cases"
 
 
@@ -112,7 +112,7 @@ def test_an_undecided_case_is_not_a_failure_and_meets_the_gate():
     once = replace(CASE, level=0, svo_rad=None)
     ran = outcomes([(CASE, 0, -600.0), (CASE, 1, -700.0), (once, 0, -600.0)])
     summary = summarise(ran, (0, 2), 0.2)
-    assert summary.counts == "1 failure (0 contacts), 1 undecided in 2 cases"
+    assert summary.counts == "1 failure (0 with contact), 1 undecided in 2 cases"
     assert [(of.failures, of.undecided) for of in summary.levels.values()] == [(0, 1), (1, 0)]
     assert all(of.fmc > 0.0 and of.regions == 1 for of in summary.levels.values())
     gate = Gate("failures").check(summarise(ran[2:], tolerated=0.2))
