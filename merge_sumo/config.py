@@ -260,8 +260,8 @@ class Levels:
     level: AnyLevels = "all"
     """POV levels, separated by commas: 0, 1, 2, or own (your own driver, given with --pov).
 
-    Level 0 ignores the VUT. Level 1 makes room, because it assumes that the VUT only
-    accelerates. Level 2 assumes that the VUT reacts.
+    Level 0 ignores the VUT. Level 1 makes room, because it assumes that the VUT does not yield.
+    Level 2 assumes that the VUT reacts.
     """
 
 
