@@ -56,7 +56,7 @@ def _quantities(cases: Sequence[Case], scenario: Scenario) -> dict[tuple[str, st
                 x_m, v_mps = case.starts()[row]
                 due_s.append(-x_m / v_mps if v_mps > 0.0 else scenario.timeout_s)
             name = "POV" if row == POV else f"car {VEHICLES[row]}"
-            values[f"{name} due at M", "s"] = due_s
+            values[f"{name} would reach M after", "s"] = due_s
     for coordinate in scenario.dimensions(cases[0].level):
         own = [coordinate.of(case) or 0.0 for case in cases]
         values[coordinate.name, coordinate.unit] = own
@@ -77,7 +77,7 @@ def failure_regions(
 
     Example:
         >>> failure_regions(run.cases, 1, regions_of(run.cases))[0].where
-        'POV due at M 8.29 to 8.80 s'
+        'POV would reach M after 8.29 to 8.80 s'
     """
     judged = [o for o in outcomes if o.case.level == level and o.margin is not None]
     if not judged:

@@ -383,8 +383,8 @@ class Measures:
 
     @measure(
         worse="high",
-        label="braking of the POV over 1.6 s up to M",
-        column="POV brakes over 1.6 s",
+        label="mean braking of the POV over 1.6 s up to M",
+        column="POV brakes (mean of 1.6 s)",
     )
     def pov_sustained_brake_mps2(self) -> float | None:
         """Largest mean braking of the POV over 1.6 s up to t1, or over a shorter episode."""

@@ -134,7 +134,7 @@ def _shares(run: RecordedCampaign) -> Facts:
     for one in known.levels:
         if one.without_verdict < one.cases:
             fact = partial(Fact, file=SHARES.name, level=one.level)
-            yield fact(STARTS_THAT_FAIL, one.shown, "levels: failures of cases")
+            yield fact(STARTS_THAT_FAIL, one.shown, "levels: failures / cases")
             yield fact("uniform starts simulated", one.cases, "levels: cases")
             if one.without_verdict:
                 name = "uniform starts without a verdict"
@@ -168,9 +168,9 @@ def _of_level(run: RecordedCampaign, level: int, summary: LevelSummary, failing:
         yield fact(FAILURES, summary.failures, failing)
         if run.tolerated:
             yield fact(UNDECIDED, summary.undecided, "draw")
-        yield fact("regions", summary.regions, f"{failing}: starts")
+        yield fact("regions", summary.regions, f"{failing}: their starts")
         radius = radius_for(len(run.scenario.dimensions(level)))
-        yield fact("FMC", summary.fmc, f"{failing}: starts within {radius:.2g}")
+        yield fact("FMC", summary.fmc, f"{failing}: {radius:.2g} around their starts")
     if run.scenario.lane_m is None:
         return
     at_level = [outcome for outcome in run.cases if outcome.case.level == level]

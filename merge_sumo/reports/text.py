@@ -436,8 +436,11 @@ def axes_of(found: Explanation, case: Case) -> Iterator[tuple[Axis, str, str]]:
 def _axis(axis: Axis, name: str, unit: str) -> str:
     values = [axis.value, axis.low, axis.high, axis.step, *axis.passing]
     value, low, high, step, *passing = [f"{v:.{axis.digits}f} {unit}".rstrip() for v in values]
-    passes_at = either(passing) if passing else "no other value"
-    return f"{name} is {value}; passes at {passes_at} (tried from {low} to {high}, every {step})"
+    tried = f"tried from {low} to {high} in steps of {step}"
+    if not passing:
+        return f"{name} is {value}; no other value passes ({tried})"
+    found = f"{either(passing)} ({tried}, then refined to the last digit)"
+    return f"{name} is {value}; the case passes at {found}"
 
 
 @lines_of.register

@@ -149,7 +149,7 @@ class TestParameters:
         )
         assert (worst.index, other.found.vut) == (result.found.index, "design2?kp=1.3")
         page = ms.open_run(folder).report().read_text("utf-8")
-        assert "the VUT's gap_m is 16.20; passes at" in page
+        assert "the VUT's gap_m is 16.20; the case passes at" in page
         assert "with design2?kp=1.3: the VUT's kp is 1.3000" in page
 
     @pytest.mark.slow

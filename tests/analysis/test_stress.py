@@ -66,7 +66,7 @@ def test_the_report_lists_robust_failures_first_where_there_is_a_stress_test(run
     assert STRESS.read(run.folder) == found
     page = (run.folder / "report.html").read_text(encoding="utf-8")
     assert "Sensitivity to small changes" not in page
-    assert "Worst failures, one of each region first" in page
+    assert "Worst failures: the worst of each region, then the second of each" in page
     *others, robust = found.failures
     rungs = (
         Rung("one", "<b>one</b>", runs=(Flips(tuple(others)),)),
@@ -81,7 +81,7 @@ def test_the_report_lists_robust_failures_first_where_there_is_a_stress_test(run
     assert "1 result changed although nothing was changed" in page
     assert "&lt;b&gt;one&lt;/b&gt;" in page
     assert "<b>one</b>" not in page
-    listed = page[page.index("Worst failures, robust ones first") :]
+    listed = page[page.index("Worst failures: robust ones first") :]
     assert listed.index(f'data-case="{robust}"') == listed.index("data-case=")
 
 

@@ -34,7 +34,7 @@ class TestRegions:
         outcomes = over_the_pool(lambda x, v: 8.3 < -x / v < 8.8)
         (region,) = failure_regions(outcomes, 1, regions_of(outcomes))
         # The first start due is (-220 m, 26.5 m/s), the last (-255 m, 29 m/s).
-        assert region.where == "POV due at M 8.30 to 8.79 s"
+        assert region.where == "POV would reach M after 8.30 to 8.79 s"
         assert region.failures == region.cases == region.failing == sum(o.failed for o in outcomes)
 
     def test_have_numbers_from_the_largest_and_are_not_those_of_another_level(self):
@@ -46,7 +46,7 @@ class TestRegions:
         first, second = failure_regions(outcomes, 2, regions_of(outcomes))
         assert (first.number, first.failures, second.number, second.failures) == (0, 8, 1, 8)
         bounds = "x_POV0 -185 to -180 m, v_POV0 33.5 to 35.0 m/s"
-        assert second.where == f"POV due at M 5.14 to 5.52 s, {bounds}"
+        assert second.where == f"POV would reach M after 5.14 to 5.52 s, {bounds}"
 
     def test_of_a_level_where_everything_fails_are_the_whole_pool(self):
         outcomes = over_the_pool(lambda x, v: True)

@@ -326,7 +326,8 @@ function showMotion(i) {
   whyCharts(i);
   at(failed(i) ? moving.until : 0);
   const [row, what] = cases.conflict[i];
-  Object.assign(byId("before"), { title: `Plays from 3 s before ${what} at ${fixed(row * DT, 1)} s`, onclick: () => { at(row - 3 / DT); if (!playing) play(true); } });
+  const short = what.endsWith("collision") ? "lowest TTC" : what.split(" ")[1]; // such as: the contact, the end of the episode
+  Object.assign(byId("before"), { textContent: `3 s before ${short}`, title: `Plays from 3 s before ${what} at ${fixed(row * DT, 1)} s`, onclick: () => { at(row - 3 / DT); if (!playing) play(true); } });
 }
 function timeline(i) { // the events of a case as a list, and as marks on the time axis of the player
   const marks = [], lines = [], end = moving && (moving.rows - 1) * DT;
