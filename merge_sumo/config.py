@@ -194,7 +194,7 @@ class Search:
     others run. About three times the number of workers is a good value.
     """
     repeat: int = 1
-    """Runs of each case, if controller or sensors are random.
+    """Runs per case, for random controllers or sensors.
 
     The runs of a case differ by the seed that the controller gets, and by the noise and the
     dropouts of --sense. Without these, all runs are alike. Each run counts as one of the --cases.
@@ -215,7 +215,8 @@ class Execution:
     """How cases are run."""
 
     workers: int | str | None = 1
-    """Number of worker processes, auto, or a Dask scheduler, tcp://HOST:PORT. [default: auto]
+    """Number of worker processes, or auto, or tcp://HOST:PORT, the address of a Dask scheduler.
+    [default: auto]
 
     With auto each core gets one process. A campaign of up to 1,000 cases with built-in drivers uses
     only one. The number does not change the outcomes. On the command line the default is auto, in
@@ -250,7 +251,7 @@ class Page(Junit):
     """Files that a comparison writes."""
 
     out: AnyPath | None = None
-    """New page (.html) that shows the changed cases and both motions of each."""
+    """New page (.html) that shows each case with a new result, with its motion before and now."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -301,8 +302,9 @@ class CampaignOptions(Execution, Junit, Test, Search, Levels):
     it. The results are in a new run folder. Ctrl-C ends the campaign after the running batch and
     prints how to continue. A second Ctrl-C stops at once.
 
-    Exit code: 1 if the VUT never merged, or if something occurred that --gate names, such as a
-    failure; 2 for wrong usage; 130 or 143 if stopped; else 0.
+    Exit code: 0 if the campaign ends, even with failures; 1 if an event occurs that you gave with
+    --gate (for example --gate failures), or if the VUT merges in none of the cases; 2 for wrong
+    usage; 130 or 143 if stopped.
 
     Example:  merge-sumo campaign --vut design1 --level 0 --cases 400 --seed 1
 
@@ -471,9 +473,9 @@ class Explain(StudyOptions):
     """Explain a failure: find the smallest change of one value that makes the case pass.
 
     merge-sumo changes one value at a time: a coordinate of the start, the level of the POV, or a
-    parameter of the controller. It tries other values, and confirms each printed value with a
-    second run. A campaign with a built-in VUT does this for its worst failure, but does not change
-    parameters. The report then shows the explanation.
+    parameter of the controller. It searches the nearest value with which the case passes, and
+    confirms this value with a second run. If the VUT is built in, `merge-sumo campaign` has already
+    explained its worst failure, without changing parameters.
 
     Example:  merge-sumo explain runs/design1
     """
@@ -560,8 +562,9 @@ class Rerun(Page, Levels, StudyOptions):
     RUN can also be a cases file, written by `merge-sumo export --format cases`. Then --out writes
     a new cases file instead of an HTML page.
 
-    If your own controller does not repeat the recorded result of a case, the case runs once more.
-    If these two new runs differ from each other, the case is "not repeatable" and does not count.
+    Some controllers give another result in each run. To find them, each case of your own controller
+    whose result changed runs a second time. If this second run differs from the first run, the case
+    is "not repeatable", and counts neither as broken nor as fixed.
 
     Exit code: 0 if no case broke, 1 if a case broke, 2 for wrong usage. A case broke if it passed
     before and does not pass now. With a cases file the exit code is also 1 for a new error or

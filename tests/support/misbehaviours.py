@@ -92,7 +92,7 @@ CATALOGUE = {
     "a subprocess": acts("import subprocess; subprocess.Popen(['sleep', '600'])"),
     "a text of 10 MB": acts("raise ValueError('x' * 10_000_000)", "ValueError: " + "x" * 300),
     "an answer that cannot be shown": acts(
-        "return type('Odd', (), {'__repr__': lambda s: 1 / 0})()", "(ZeroDivisionError when"
+        "return type('Odd', (), {'__repr__': lambda s: 1 / 0})()", "(ZeroDivisionError while"
     ),
     "writes into all descriptors": acts(
         """

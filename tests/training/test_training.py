@@ -258,7 +258,7 @@ class TestTraining:
         words = ("train", "--check", "--only", "pov1", "--cases", 4, "--json", "--out", trained[0])
         done = invoke(*words, "--scenario", ring)
         assert json.loads(done.stdout)["pov1"] == read_manifest(trained[0])["pov1"]["check"]
-        assert "was trained for ring: say with `scenario`" in str(invoke(*words).exception)
+        assert "was trained for ring: set `scenario`" in str(invoke(*words).exception)
 
     def test_a_process_that_ends_is_a_sentence(self, tmp_path, monkeypatch):
         monkeypatch.setattr(helix, "_train_one", os._exit)
