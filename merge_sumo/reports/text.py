@@ -140,7 +140,7 @@ def comparison_lines(compared: Comparison) -> list[str]:
             changed = [case for case in version_change.cases if case.change is change]
             if changed and change.group in ("worse", "not counted"):
                 first = f"the first {LISTED} of " if len(changed) > LISTED else ""
-                text.append(f"{change}, {first}{len(changed)}:")
+                text.append(f"{first}{len(changed)} {change}:")
                 for case in changed[:LISTED]:
                     text.append(f"  case {case.later.index}: {change_in_words(case)}")
     return [*text, compared.source, *compared.notes]
