@@ -15,15 +15,16 @@ HEADINGS = ("Answered", "Not answered", *(effect.value for effect in Effect))
 PAGE = Path(__file__).resolve().parent.parent / "docs" / "reference" / "traci.md"
 HEAD = """# TraCI
 
-This page lists what a controller that drives by TraCI can ask and command, and what each command \
+This page lists the TraCI questions and commands that a controller can use, and what each command \
 does. [The tutorial](../tutorials/traci-controller.md) shows how to write one.
 
 `python tools/traci_page.py` makes this page from SUMO's own client: do not edit it.
 
 ## How SUMO answers
 
-A second SUMO answers questions and carries out commands. It runs as a library in a separate \
-process, without a port. It has the original net and all vehicles in their present state:
+Your controller talks to a second SUMO, which answers its questions and carries out its commands. \
+This SUMO runs as a library in a separate process, without a port. It contains the original net \
+and all vehicles in their present state:
 
 | vehicle | meaning |
 |---|---|
@@ -33,9 +34,9 @@ process, without a port. It has the original net and all vehicles in their prese
 
 Questions:
 
-- merge-sumo itself answers two questions that this SUMO cannot answer: the position of a vehicle \
+- This SUMO cannot answer two questions, so merge-sumo answers them: the position of a vehicle \
 after the step, and the vehicles that departed and arrived during several steps.
-- A question about an unknown object is refused, as in SUMO.
+- A question about an unknown object returns an error, as in SUMO.
 - Subscriptions work for all variables of an object. Context subscriptions work for the vehicles \
 around a vehicle or a junction, without filters. A subscription ends only when you end it: its \
 begin and end time have no effect.
@@ -44,13 +45,14 @@ begin and end time have no effect.
 
 Commands:
 
-- Commands act on `vut` and its type. SUMO's step turns them into a speed. The campaign gives the \
-VUT this speed by eq. (4) of the paper, within the limits of the scenario.
-- `vut` departs with its speed set. A controller without commands keeps its speed.
-- On a road with an acceleration lane, the lane that SUMO's step gives the VUT is its \
-[merge request](vuts.md#merging-from-an-acceleration-lane).
-- All other commands are accepted without effect, or refused with a reason as an error of that \
-command. The connection stays open.
+- Commands act on `vut` and its type. In its step, the second SUMO computes the speed that \
+follows from them. merge-sumo then gives the VUT this speed by eq. (4), the paper's equation of \
+motion, within the limits of the scenario.
+- `vut` departs as if `setSpeed` had set its speed. Without commands it keeps this speed.
+- On a road with an acceleration lane, the lane of `vut` after SUMO's step is the [merge \
+request](vuts.md#merging-from-an-acceleration-lane).
+- Other commands have no effect, or return an error with the reason. The connection stays open in \
+both cases.
 
 [Why SUMO decides](../explanation/decisions/traci-server.md) has the reasons.
 
@@ -66,81 +68,91 @@ last step.
 
 ## Start, end and connection
 
-- `--vut "traci:COMMAND {port}"` starts the program, starts it again if it ends, and stops it \
-at the end. The port replaces `{port}`, and is in the environment variable \
-`MERGE_SUMO_PORT`. If a program calls `traci.start(...)`, add this port as the argument `port=`.
-- `--vut traci` waits for a program that you start, on 127.0.0.1:8813. `--vut traci:9000` waits on \
-another port.
+- `--vut "traci:COMMAND {port}"` starts your program, and starts it again if it ends. It stops \
+the program at the end of the campaign. merge-sumo replaces `{port}` by the port, and also sets \
+the environment variable `MERGE_SUMO_PORT` to it. If a program calls `traci.start(...)`, add this \
+port as the argument `port=`.
+- `--vut traci` waits for a program that you start, on 127.0.0.1:8813. `--vut traci:9000` waits \
+on another port.
 - The program can run for one episode, for several or for all. It can keep one connection or open \
 a new one for each episode. merge-sumo serves one client at a time.
-- In every episode the vehicles `pov` and `vut` depart. They arrive when the episode ends, or at \
-the end of the net. The road is then empty for one step.
-- SUMO opens no port. The only port of a campaign is on the loopback interface. On Linux it \
-serves only connections of your user ([the rules, also for other systems]\
-(../../SECURITY.md#the-traci-port)). The program can run elsewhere, for example in a \
-container that shares the network, as the same user.
-- If the program ends and a process that it started keeps the connection open, every case ends as \
-an error.
+- An episode is one simulated case. At its start the vehicles `pov` and `vut` depart. A vehicle \
+arrives when the episode ends, or when it reaches the end of the net. Between two episodes the \
+road is empty for one step.
+- SUMO opens no port. merge-sumo opens one port, on the loopback interface. On Linux this port \
+serves only connections of your user ([the rules, also for other \
+systems](../../SECURITY.md#the-traci-port)). The program can also run in a container, if the \
+container shares the network and the program runs as the same user.
+- The program can start another process, which keeps the connection open after the program has \
+ended. Then every case ends as an error.
 
 ## Commands that move the VUT
 
 - `setSpeed` acts in the next step, until `setSpeed(-1)`.
-- `setSpeed`, `slowDown` and `setAcceleration` set the speed. When `slowDown` or `setAcceleration` \
-has ended, and after `setSpeed(-1)`, the car-following model of SUMO drives the VUT.
+- `slowDown` and `setAcceleration` set the speed for a time. After this time, and after \
+`setSpeed(-1)`, the car-following model of SUMO drives the VUT.
 - `setSpeedMode(31)`, `setTau`, `openGap`, `setStop` and other commands act as in SUMO.
 - `sigma` is 0, so that episodes do not depend on each other. `setImperfection` changes `sigma`, \
 and episodes then depend on each other.
-- Without an acceleration lane, lane changes have no effect. `changeSublane`, reroutes, colours \
-and shapes, views, and keys of `setParameter` with a dot have no effect on any road. The scenario \
-sets the path. If such a command could move a vehicle in SUMO, the last lines of a campaign name \
-it, with the number of cases in which the controller gave it.
+- The scenario sets the path of the VUT. Lane changes therefore have no effect on a road without \
+an acceleration lane. On all roads, these commands have no effect: `changeSublane`, reroutes, \
+colours and shapes, views, and keys of `setParameter` with a dot.
+- Some commands without effect could move a vehicle in SUMO. The last lines of a campaign name \
+these commands, and in how many cases the controller used them.
 - `setParameter` stores keys without a dot.
-- `moveTo`, `remove`, `saveState` and similar commands are refused. The connection stays open.
+- `moveTo`, `remove`, `saveState` and similar commands return an error. The connection stays open.
 
 ## A vehicle model of the controller
 
-- `setPreviousSpeed` sets the speed of `vut` after the next step. It overrides all other commands, \
-in any order, for this step only. In a step without it, a commanded speed acts, or `vut` keeps \
-its speed. In a long `simulationStep(time)` it applies to all steps.
-- `moveToXY` sets the position of the front bumper after the next step. merge-sumo derives the \
-speed: the distance along the lane from the point of the previous step, divided by 0.1 s. The \
-first point counts from the position of `vut`. `getPosition` then returns the point, as in SUMO.
-- With `moveToXY`, `vut` has the new speed only from the end of the step on (eq. (4)). It is \
-therefore a little before or after the point: by 0.1 s times the speed gained since the first \
-point, and after a clipped step by the clipped distance. `getLanePosition`, gaps and verdicts use \
-the position of `vut`.
-- With `setPreviousSpeed` and `moveToXY` in the same step, the point changes only the answer of \
-`getPosition`.
+A controller can contain its own vehicle model, and tell merge-sumo the speed or the position \
+that this model reaches:
+
+- `setPreviousSpeed` sets the speed that `vut` has after the next step. In this step it overrides \
+all other commands, whether they come before or after it. In a step without it, `vut` follows the \
+last command that set a speed, or keeps its speed. A call of `simulationStep(time)` can contain \
+several steps: `setPreviousSpeed` then applies to all of them.
+- `moveToXY` sets the position of the front bumper after the next step. merge-sumo computes the \
+speed from it: the distance along the lane since the point of the previous step, divided by 0.1 \
+s. For the first point, it takes the distance from the position of `vut`. `getPosition` then \
+returns the point, as in SUMO.
+- With `moveToXY`, the position of `vut` differs slightly from the point, because `vut` reaches \
+the new speed only at the end of the step (eq. (4)). The difference is 0.1 s times the speed \
+gained since the first point. A clipped step changes it by the clipped distance. \
+`getLanePosition`, gaps and verdicts use the position of `vut`, not the point.
+- If a step has both `setPreviousSpeed` and `moveToXY`, the speed comes from `setPreviousSpeed`. \
+The point then changes only the answer of `getPosition`.
 - `moveToXY` accepts points up to 2 m from the lane, and refuses others. Edge, lane, angle, \
-`keepRoute` and `matchThreshold` have no effect. Next to an acceleration lane the nearer lane \
-counts: a model that crosses over merges.
-- The limits of the scenario clip the speed. `clipped_steps` counts clipped steps up to M, and \
-`getSpeed` returns the driven speed. A model must continue from that speed. A negative speed is \
-refused. A speed that is not a number ends the case as an error.
-- In such a loop, plain SUMO returns from `getSpeed` the speed that its driver chose. Here \
-`getSpeedWithoutTraCI` returns that speed, of the last step (after `setSpeed("vut", -1)`).
-- Leave out `--act`, which adds its own delay and lag. A controller with its own \
-first-order lag of 0.3 s drives like the same controller with `--act lag_s=0.3` in place of the \
-lag, to 1e-6 m (`pytest tests/controllers/test_traci_commands.py -k VehicleModel`).
+`keepRoute` and `matchThreshold` have no effect. On a road with an acceleration lane, `vut` is on \
+the lane that is nearer to the point: a model that crosses to the mainline merges.
+- The limits of the scenario clip the speed. `clipped_steps` counts the clipped steps before the \
+merge point M. `getSpeed` returns the clipped speed, and your model must continue from it. A \
+negative speed returns an error. A speed that is not a number ends the case as an error.
+- In plain SUMO, a model that calls `setPreviousSpeed` in each step gets from `getSpeed` the \
+speed that SUMO's driver chose. Here `getSpeedWithoutTraCI` returns the speed that SUMO's driver \
+chose in the last step, if you called `setSpeed("vut", -1)` before.
+- Leave out `--act`, which adds its own delay and lag. The results agree: a controller with its \
+own first-order lag of 0.3 s moves as the same controller without this lag and with `--act \
+lag_s=0.3`, to 1e-6 m (`pytest tests/controllers/test_traci_commands.py -k VehicleModel`).
 
 ## Lane changes
 
-- Edges and lanes come from the net file. In `us23-lane`, both lanes are on the edge `lane`, \
-and lane 0 is the acceleration lane. `getLanePosition`, `getNeighbors`, `getLeftFollowers`, \
+- Edges and lanes come from the net file. In `us23-lane`, both lanes are on the edge `lane`, and \
+lane 0 is the acceleration lane. `getLanePosition`, `getNeighbors`, `getLeftFollowers`, \
 `couldChangeLane` and similar functions use these lanes.
 - `vut` departs in lane change mode 0: only the controller changes its lane. `changeLane` and \
-`changeLaneRelative` act in the next step, whatever drives on the other lane. A controller that \
-never changes lanes drives to the end of the lane. There the VUT is moved or stopped, as the \
-scenario sets it.
+`changeLaneRelative` act in the next step, even if another vehicle is in the way. If the \
+controller never changes the lane, the VUT drives to the end of the acceleration lane. There \
+merge-sumo moves it to the mainline, or stops it if the scenario sets `lane_end = "stop"`.
 - `setLaneChangeMode` acts as in SUMO. In mode 512 SUMO refuses a change into a gap that it \
 considers unsafe. In mode 1621, the default of SUMO, the lane-change model merges by itself. It \
-adapts the speed only after `setSpeed("vut", -1)`. The car-following model then stops before the \
-end of the lane until the VUT can merge.
-- The merge is final: a later lane change of `vut` is undone.
+can adapt the speed only after `setSpeed("vut", -1)`. The car-following model then stops the VUT \
+before the end of the lane, until the VUT can merge.
+- The merge is final: merge-sumo undoes a later lane change of `vut`.
 
 ## All functions
 
-The following lists have all functions of SUMO's client, by domain.
+These lists contain all functions of SUMO's client, by domain. "Refused" means that the command \
+returns an error.
 """
 TAIL = """
 ## Next step
