@@ -493,8 +493,8 @@ def timelines(run: RecordedCampaign, outcomes: Sequence[Outcome]) -> dict[int, T
 def _avoidance(one: Avoidance) -> list[Event]:
     """Return the drivers that avoid a failure from its start, and the last time to take over."""
     by = ", ".join(one.avoided_by) or "none"
-    text = f"reference drivers that avoid this failure from the start: {by}"
-    events = [Event(0.0, f"{text}; a careful POV avoids it" if one.pov_careful else text)]
+    text = f"reference drivers that avoid this failure: {by}"
+    events = [Event(0.0, f"{text}; also a careful POV" if one.pov_careful else text)]
     if one.latest_takeover_s is not None:
         text = f"last time at which the reference driver {TAKES_OVER} could still take over"
         events.append(Event(one.latest_takeover_s, text))
