@@ -302,9 +302,9 @@ class CampaignOptions(Execution, Junit, Test, Search, Levels):
     it. The results are in a new run folder. Ctrl-C ends the campaign after the running batch and
     prints how to continue. A second Ctrl-C stops at once.
 
-    Exit code: 0 if the campaign ends. With --gate failures it is 1 if a case fails (other gates
-    likewise). It is also 1 if the VUT merges in none of the cases, 2 for wrong usage, and 130 or
-    143 if stopped.
+    Exit code: 0 if the campaign ends, 1 if the VUT merges in none of the cases, 2 for wrong usage,
+    130 or 143 if stopped. The option --gate makes it 1 if a certain result occurs: with
+    '--gate failures', if a case fails.
 
     Example:  merge-sumo campaign --vut design1 --level 0 --cases 400 --seed 1
 
@@ -474,8 +474,8 @@ class Explain(StudyOptions):
 
     merge-sumo changes one value at a time: a coordinate of the start, the level of the POV, or a
     parameter of the controller. It searches the nearest value with which the case passes, and
-    confirms this value with a second run. For a built-in VUT, `merge-sumo campaign` has already
-    explained the worst failure. It changed the start and the level, but not the parameters.
+    confirms this value with a second run. For a built-in VUT, the campaign already contains such an
+    explanation of the worst failure, but only with changes of the start and the level.
 
     Example:  merge-sumo explain runs/design1
     """
@@ -562,9 +562,9 @@ class Rerun(Page, Levels, StudyOptions):
     RUN can also be a cases file, written by `merge-sumo export --format cases`. Then --out writes
     a new cases file instead of an HTML page.
 
-    If your own controller gets a new result in a case, merge-sumo runs this case a second time. If
-    the second run differs from the first run, the case is "not repeatable", and counts neither as
-    broken nor as fixed.
+    If the result of your own controller differs from the recorded result, merge-sumo runs the case
+    once more with the same controller. If these two new runs differ from each other, the case is
+    "not repeatable", and counts neither as broken nor as fixed.
 
     Exit code: 0 if no case broke, 1 if a case broke, 2 for wrong usage. A case broke if it passed
     before and does not pass now. With a cases file the exit code is also 1 for a new error or
