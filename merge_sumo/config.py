@@ -303,8 +303,8 @@ class CampaignOptions(Execution, Junit, Test, Search, Levels):
     prints how to continue. A second Ctrl-C stops at once.
 
     Exit code: 0 if the campaign ends, 1 if the VUT merges in none of the cases, 2 for wrong usage,
-    130 or 143 if stopped. The option --gate makes it 1 if a certain result occurs: with
-    '--gate failures', if a case fails.
+    130 or 143 if stopped. With --gate, the exit code is also 1 if the result that you name occurs.
+    For example, '--gate failures' gives exit code 1 if a case fails.
 
     Example:  merge-sumo campaign --vut design1 --level 0 --cases 400 --seed 1
 
@@ -435,9 +435,9 @@ class Probability(EngineChoice, StudyOptions):
     """Estimate the failure probability of a VUT, with a valid confidence interval.
 
     The cases of the campaign were chosen to fail, so their share of failures is not a probability.
-    But these cases show which starts are likely to fail. merge-sumo draws some new cases from these
-    starts, and others from all remaining starts. The interval is valid even if the campaign has
-    missed failures.
+    But they show which starts are likely to fail. merge-sumo divides all possible starts into those
+    that are likely to fail and the rest, and draws new random cases from both parts. The interval
+    is valid even if the campaign has missed failures.
 
     Example:  merge-sumo probability runs/design2
 
@@ -562,13 +562,13 @@ class Rerun(Page, Levels, StudyOptions):
     RUN can also be a cases file, written by `merge-sumo export --format cases`. Then --out writes
     a new cases file instead of an HTML page.
 
-    If the result of your own controller differs from the recorded result, merge-sumo runs the case
-    once more with the same controller. If these two new runs differ from each other, the case is
-    "not repeatable", and counts neither as broken nor as fixed.
+    If your own controller gives another result than the recorded one, merge-sumo runs the case a
+    second time with the new controller. If its two runs differ from each other, the case is "not
+    repeatable", and counts neither as broken nor as fixed.
 
     Exit code: 0 if no case broke, 1 if a case broke, 2 for wrong usage. A case broke if it passed
-    before and does not pass now. With a cases file the exit code is also 1 for a new error or
-    contact, and for a margin that drops by more than the tolerance of the file.
+    before and does not pass now. With a cases file, the exit code is also 1 if a case has a new
+    error or contact, or if its margin drops by more than the tolerance that the file sets.
 
     Example:  merge-sumo rerun runs/design2 3 7 --vut design2 --out changes.html
 
