@@ -69,7 +69,7 @@ METAVARS: Mapping[str, str] = {
     "N": "workers seed seeds repeat",
     "SHARE": "tolerated confidence",
     "GATE": "gates",
-    "M": "x_pov0_m",
+    "METRES": "x_pov0_m",
     "M/S": "v_pov0_mps",
     "RAD": "svo_rad",
     "RUN INDEX": "recorded",

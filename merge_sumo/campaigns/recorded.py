@@ -427,8 +427,7 @@ def has_converged(outcomes: Sequence[Outcome], tolerated: float = 0.0) -> bool:
     """Return whether the last cases added little to the coverage of all levels together.
 
     A search without a failure continues. A region of failures without a case near it is in no
-    coverage: the rule ends a search early, and does not
-    show that all failures were found.
+    coverage: the rule ends a search early, and does not show that all failures were found.
 
     Args:
         outcomes: the outcomes, in the order of their index. They alone decide, so a resumed

@@ -256,12 +256,12 @@ class Measures:
         """Score P of the paper, never positive. None after an error (VUT_ERROR, SIM_ERROR)."""
         return merge_score(self.trajectory)
 
-    @measure(label="front bumpers, x_POV - x_VUT", column="Δx at M", missing=math.inf)
+    @measure(label="front bumper at M, POV minus VUT", column="Δx at M", missing=math.inf)
     def dx_m(self) -> float | None:
         """Distance of the front bumpers, x_POV - x_VUT."""
         return self._at_m(0)
 
-    @measure(label="v_POV - v_VUT", column="dv", missing=0.0)
+    @measure(label="speed at M, POV minus VUT", column="dv", missing=0.0)
     def dv_mps(self) -> float | None:
         """Difference of the speeds, v_POV - v_VUT."""
         return self._at_m(1)

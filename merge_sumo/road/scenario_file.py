@@ -69,7 +69,7 @@ def _read(path: Path) -> Scenario:
 
 
 COMMENTS = {
-    "net": "the SUMO net; its path starts at the folder of this file",
+    "net": "the SUMO net; its path is relative to the folder of this file",
     "mainline": "edges of the mainline in driving order, past the merge point M",
     "ramp": "edges of the ramp in driving order, past M",
     "x_pov0_m": "start of the POV: low, high; position of its front bumper, negative before M",
@@ -114,5 +114,5 @@ def to_toml(scenario: Scenario, notes: Sequence[str]) -> str:
         if value is None:
             continue
         text, comment = f"{name} = {toml_value(value)}", COMMENTS.get(name)
-        lines.append(f"{text:<44}# {comment}" if comment else text)
+        lines.append(f"{text:<43} # {comment}" if comment else text)
     return "\n".join(lines) + "\n"
